@@ -1,0 +1,63 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Argument checks of the bindings. Python checks first and has the better words; these protect memory
+// when torch.ops.pred.* is called directly. std::invalid_argument becomes ValueError in Python.
+#pragma once
+
+#include <torch/csrc/stable/tensor.h>
+#include <torch/headeronly/core/ScalarType.h>
+
+#include <sstream>
+#include <stdexcept>
+#include <string>
+
+namespace pred {
+
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+
+template <class... Parts>
+std::string concat(const Parts&... parts) {
+  std::ostringstream text;
+  (text << ... << parts);
+  return text.str();
+}
+
+inline std::string shape_text(const Tensor& tensor) {
+  std::string text = "[";
+  for (int64_t dim = 0; dim < tensor.dim(); ++dim) {
+    text += (dim ? ", " : "") + std::to_string(tensor.size(dim));
+  }
+  return text + "]";
+}
+
+#define PRED_CHECK(condition, ...)                                              \
+  do {                                                                          \
+    if (!(condition)) throw std::invalid_argument(::pred::concat(__VA_ARGS__)); \
+  } while (0)
+
+inline void check_cpu_tensor(const char* op, const char* name, const Tensor& tensor, int64_t dim, ScalarType dtype) {
+  PRED_CHECK(tensor.is_cpu(), op, ": ", name, " must be a CPU tensor");
+  PRED_CHECK(tensor.dim() == dim, op, ": ", name, " must have ", dim, " dimensions, got shape ", shape_text(tensor));
+  PRED_CHECK(tensor.scalar_type() == dtype, op, ": ", name, " must have the dtype of the other arguments");
+}
+
+// Calls `body` with T = float or double.
+#define PRED_DISPATCH_FLOAT(op, dtype, ...)                                                  \
+  [&] {                                                                                      \
+    switch (dtype) {                                                                         \
+      case ::pred::ScalarType::Float: {                                                      \
+        using T = float;                                                                     \
+        return __VA_ARGS__();                                                                \
+      }                                                                                      \
+      case ::pred::ScalarType::Double: {                                                     \
+        using T = double;                                                                    \
+        return __VA_ARGS__();                                                                \
+      }                                                                                      \
+      default:                                                                               \
+        throw std::invalid_argument(std::string(op) + ": dtype must be float32 or float64"); \
+    }                                                                                        \
+  }()
+
+}  // namespace pred

@@ -1,0 +1,155 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""The compiled library: whether it is there, and if not, why.
+
+``PRED_BACKEND`` is read at each eager call: ``auto`` (native where possible), ``native`` (an error where it
+is not) or ``reference`` (plain PyTorch). A compiled graph keeps the value it was traced with.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+_FOLDER = Path(__file__).resolve().parent
+_LIBRARY = _FOLDER / ("libpred_cpu.dylib" if sys.platform == "darwin" else "libpred_cpu.so")
+_INSTALL_HINT = "install torch first, then run: pip install --no-build-isolation ."
+
+
+def _build_record() -> dict[str, Any]:
+    """What the build left behind: ``native``, ``reason``, ``torch``."""
+    try:
+        return dict(json.loads((_FOLDER / "build_info.json").read_text()))
+    except FileNotFoundError:
+        return {"native": False, "reason": "the package was never built"}
+    except (OSError, ValueError) as error:
+        return {"native": False, "reason": f"build_info.json is unreadable: {error}"}
+
+
+def _load() -> str | None:
+    """Loads the library once; returns why it is missing, or None."""
+    if not _LIBRARY.exists():
+        return str(_build_record().get("reason") or f"{_LIBRARY.name} is not in {_FOLDER}")
+    try:
+        torch.ops.load_library(str(_LIBRARY))
+    except (OSError, RuntimeError) as error:
+        return f"{_LIBRARY.name} does not load: {error}"
+    return None
+
+
+_MISSING: str | None = _load()
+_warned_cuda: set[str] = set()
+
+if _MISSING is not None and os.environ.get("PRED_BACKEND", "auto") == "auto":
+    warnings.warn(
+        f"pred: the compiled kernels are missing ({_MISSING}); slower PyTorch references are used. "
+        f"To build them, {_INSTALL_HINT}",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+
+
+def available() -> bool:
+    """Whether the compiled CPU library is loaded."""
+    return _MISSING is None
+
+
+def native_status() -> dict[str, Any]:
+    """Facts for ``pred doctor`` and benchmark records.
+
+    Returns:
+        ``available``, ``reason`` (why not, else None), ``path``, ``build`` (record of the build and, when loaded,
+        compiler, build type, sanitizers and levels), ``cpu_capability`` (level in force, or None).
+    """
+    build = _build_record()
+    level = None
+    if available():
+        lines = torch.ops.pred.build_info().splitlines()
+        info = dict(line.split("=", 1) for line in lines)
+        level = info.pop("level")
+        build |= info
+    return {
+        "available": available(),
+        "reason": _MISSING,
+        "path": str(_LIBRARY),
+        "build": build,
+        "cpu_capability": level,
+    }
+
+
+@torch.compiler.assume_constant_result
+def _backend() -> str:
+    backend = os.environ.get("PRED_BACKEND") or "auto"
+    if backend not in ("auto", "native", "reference"):
+        raise ValueError(f"PRED_BACKEND must be auto, native or reference, got {backend!r}")
+    if backend == "native" and _MISSING is not None:
+        raise RuntimeError(f"PRED_BACKEND=native, but the compiled kernels are missing ({_MISSING}); {_INSTALL_HINT}")
+    return "reference" if _MISSING is not None else backend
+
+
+@torch.compiler.assume_constant_result
+def _no_kernel(op: str, device: str, required: bool) -> bool:
+    if required:
+        raise RuntimeError(f"{op}: PRED_BACKEND=native, but there is no kernel for device {device!r}")
+    if op not in _warned_cuda:
+        _warned_cuda.add(op)
+        warnings.warn(f"{op}: no {device} kernel yet; the PyTorch reference is used", RuntimeWarning, stacklevel=3)
+    return False
+
+
+def use_native(op: str, tensor: Tensor) -> bool:
+    """Whether ``op`` runs compiled for tensors like this one.
+
+    Raises:
+        ValueError: ``PRED_BACKEND`` has an unknown value.
+        RuntimeError: it is ``native`` and the library or a kernel for the tensor's device is missing.
+    """
+    backend = _backend()
+    if backend == "reference":
+        return False
+    if tensor.device.type == "cpu":
+        return True
+    return _no_kernel(op, tensor.device.type, backend == "native")
+
+
+def register(
+    op: str,
+    *,
+    fake: Callable[..., Any],
+    setup_context: Callable[..., None] | None = None,
+    backward: Callable[..., Any] | None = None,
+    differentiable: bool = True,
+) -> None:
+    """Registers what a compiled op needs beside its kernel: shapes, derivative and autocast rule.
+
+    An op without ``backward`` raises by name when it is differentiated, since torch would otherwise leave the
+    gradient out of a sum without a word. ``differentiable=False`` marks ops whose outputs carry no gradient at all.
+    """
+    if not available():
+        return
+    name = f"pred::{op}"
+    torch.library.register_fake(name, fake)
+    if not differentiable:
+        return
+    if backward is None:
+
+        def refuse(ctx: Any, *grads: Tensor) -> None:
+            raise RuntimeError(f"{op}: a further derivative is not supported")
+
+        torch.library.register_autograd(name, refuse, setup_context=_save_nothing)
+    else:
+        torch.library.register_autograd(name, backward, setup_context=setup_context)
+    for device in ("cpu", "cuda"):  # half-precision regions compute these ops in float32
+        torch.library.register_autocast(name, device, torch.float32)
+
+
+def _save_nothing(ctx: Any, inputs: Any, output: Any) -> None:
+    pass

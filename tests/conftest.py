@@ -1,0 +1,73 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""Shared fixtures. Tests of real data read PRED_TEST_DATA, the folder that holds nuscenes_tiny/."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from pred import _native
+
+LEVELS = ("default", "avx2", "avx512", "avx512_bf16")
+
+
+@pytest.fixture(autouse=True)
+def _threads() -> Iterator[None]:
+    """A test that changes the number of threads does not change it for the next."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(params=["native", "reference"])
+def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Runs the test on the compiled kernels and on the references."""
+    if request.param == "native":
+        require_native()
+    monkeypatch.setenv("PRED_BACKEND", request.param)
+    return str(request.param)
+
+
+@pytest.fixture
+def native(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forces the compiled kernels, so that a reference is never compared with itself."""
+    require_native()
+    monkeypatch.setenv("PRED_BACKEND", "native")
+
+
+@pytest.fixture(params=LEVELS)
+def level(request: pytest.FixtureRequest, native: None, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Runs the test on every instruction-set level that this machine has."""
+    monkeypatch.setenv("PRED_CPU_CAPABILITY", request.param)
+    try:
+        _native.native_status()
+    except ValueError as error:
+        pytest.skip(str(error))
+    return str(request.param)
+
+
+def require_native() -> None:
+    """Missing kernels are a visible skip, and a failure where PRED_REQUIRE_NATIVE=1."""
+    if _native.available():
+        return
+    reason = f"compiled kernels are missing: {_native.native_status()['reason']}"
+    if os.environ.get("PRED_REQUIRE_NATIVE") == "1":
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def nuscenes_tiny() -> Path:
+    """Root of the real keyframe."""
+    folder = os.environ.get("PRED_TEST_DATA")
+    if not folder:
+        pytest.skip("PRED_TEST_DATA is not set: no real data")
+    root = Path(folder) / "nuscenes_tiny"
+    if not root.is_dir():
+        pytest.fail(f"PRED_TEST_DATA is set, but {root} is not a folder")
+    return root

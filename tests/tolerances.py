@@ -1,0 +1,35 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""Tolerances of native against reference, by dtype. A looser one in a test carries its cause in a comment."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+FORWARD = {torch.float32: 2e-6, torch.float64: 1e-13}
+GRADIENT = {torch.float32: 1e-5, torch.float64: 1e-12}
+
+
+def relative_error(actual: Tensor, expected: Tensor) -> float:
+    """Largest difference over the largest expected magnitude (at least 1e-30); inf where NaNs do not coincide."""
+    if actual.shape != expected.shape:
+        raise AssertionError(f"shape {tuple(actual.shape)} against {tuple(expected.shape)}")
+    if not torch.equal(actual.isnan(), expected.isnan()):
+        return float("inf")
+    actual, expected = actual.detach().nan_to_num(0.0).double(), expected.detach().nan_to_num(0.0).double()
+    if actual.numel() == 0:
+        return 0.0
+    scale = max(float(expected.abs().max()), 1e-30)
+    return float((actual - expected).abs().max()) / scale
+
+
+def assert_close(actual: Tensor, expected: Tensor, tolerance: float, what: str = "") -> None:
+    """Norm-wise comparison; the message names the place of the largest difference."""
+    error = relative_error(actual, expected)
+    if not error <= tolerance:
+        place = ""
+        if actual.numel() and error != float("inf"):
+            flat = int((actual - expected).abs().nan_to_num(0.0).argmax())
+            place = f" at flat index {flat}: {actual.flatten()[flat]} against {expected.flatten()[flat]}"
+        raise AssertionError(f"{what or 'value'}: relative error {error:.3g} > {tolerance:.3g}{place}")
