@@ -1,0 +1,80 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+#
+#   make demo      set up, pre-train a small model on the embedded street, draw pictures
+#   make test      set up, run all tests
+#   make sanitize  run the op tests under the address and undefined-behaviour sanitizers
+#   make lint      ruff, clang-format, mypy
+#   make bench     the benchmark suite
+#   make format    rewrite files as lint wants them
+#
+# TORCH names the torch version to install into .venv; TORCH=installed keeps the one of $(PYTHON).
+PYTHON ?= python3
+TORCH ?= 2.13.0
+VENV ?= .venv
+RUN ?= runs/demo
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check -q
+NATIVE := $(shell find csrc -type f) CMakeLists.txt setup.py
+# What nuscenes-devkit imports when its tables and geometry are used; its numpy<2 pin is left aside.
+DEVKIT := cachetools descartes fire matplotlib opencv-python-headless pyquaternion scikit-learn shapely tqdm
+
+.PHONY: demo test sanitize lint format bench clean
+.DELETE_ON_ERROR:
+
+$(VENV)/torch-$(TORCH).stamp:
+	$(PYTHON) -c "import sys; sys.exit('Python 3.10 or newer is needed, this is ' + sys.version) if sys.version_info < (3, 10) else None"
+	$(PYTHON) -m venv --clear $(if $(filter installed,$(TORCH)),--system-site-packages) $(VENV)
+	$(if $(filter installed,$(TORCH)),$(BIN)/python -c "import torch",$(PIP) install torch==$(TORCH))
+	touch $@
+
+# Build tools first: the editable install below does without pip's isolated build environment.
+$(VENV)/native.stamp: $(VENV)/torch-$(TORCH).stamp pyproject.toml $(NATIVE)
+	$(PIP) install "setuptools>=77" "cmake>=3.18" ninja "pybind11>=2.13"
+	PRED_REQUIRE_NATIVE=1 $(PIP) install --no-build-isolation -e .
+	touch $@
+
+$(VENV)/dev.stamp: $(VENV)/native.stamp
+	PRED_REQUIRE_NATIVE=1 $(PIP) install --no-build-isolation -e ".[dev]"
+	$(PIP) install --no-deps nuscenes-devkit==1.2.0
+	$(PIP) install $(DEVKIT)
+	touch $@
+
+demo: $(VENV)/native.stamp
+	if [ -e $(RUN)/config.yaml ]; then $(BIN)/pred pretrain --resume $(RUN); \
+	else $(BIN)/pred pretrain --config demo --run $(RUN); fi
+	$(BIN)/pred evaluate rendering $(RUN)
+	$(BIN)/pred view $(RUN)
+	@echo "encoder weights: $(RUN)/encoder.pth    pictures: $(RUN)/pictures"
+
+test: $(VENV)/dev.stamp
+	PRED_REQUIRE_NATIVE=1 $(BIN)/python -m pytest
+
+# A second copy of the package, built with the sanitizers, shadows the installed one. Leaks are not looked for: Python
+# itself holds memory until it exits.
+SANITIZE := $(CURDIR)/build/sanitize
+sanitize: $(VENV)/dev.stamp
+	rm -rf $(SANITIZE)
+	PRED_SANITIZE=address,undefined PRED_REQUIRE_NATIVE=1 $(PIP) install --no-deps --no-build-isolation --target $(SANITIZE) .
+	export PYTHONPATH=$(SANITIZE):$(CURDIR) PRED_REQUIRE_NATIVE=1 ASAN_OPTIONS=detect_leaks=0 \
+		LD_PRELOAD="$$(g++ -print-file-name=libasan.so):$$(g++ -print-file-name=libubsan.so)"; \
+	$(BIN)/python -P -c "from pred._native import native_status as s; assert s()['build']['sanitizers'], s()" && \
+	$(BIN)/pytest -p no:cacheprovider -k "not reference" tests/ops
+
+lint: $(VENV)/dev.stamp
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run --Werror $(shell find csrc -name '*.h' -o -name '*.cpp')
+	$(BIN)/mypy
+
+format: $(VENV)/dev.stamp
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/clang-format -i $(shell find csrc -name '*.h' -o -name '*.cpp')
+
+bench: $(VENV)/dev.stamp
+	$(BIN)/python -m benchmarks
+
+clean:
+	rm -rf build $(VENV) pred/libpred_* pred/_host* pred/build_info.json

@@ -1,0 +1,56 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Every op schema. Sizes: B batch, C channels, H W rows and columns of a BEV map, N points or samples.
+// Implementations register in ops/<op>.cpp; fake kernels and derivatives in pred/ops/<op>.py.
+#include <torch/csrc/stable/library.h>
+
+#include <string>
+
+#include "common/check.h"
+#include "common/isa.h"
+#include "common/parallel.h"
+
+STABLE_TORCH_LIBRARY(pred, m) {
+  // "key=value" lines: compiler, build type, sanitizers, levels compiled in, level in force.
+  m.def("build_info() -> str");
+  // Test hook of common/parallel.h: throws in a worker when fail_at >= 0.
+  m.def("parallel_probe(Tensor out, int grain, int fail_at) -> ()");
+
+  m.def("sample_bev(Tensor bev, Tensor grid, bool border, bool align_corners) -> Tensor");
+  m.def(
+      "sample_bev_backward(Tensor grad, Tensor bev, Tensor grid, bool border, bool align_corners, "
+      "bool need_bev, bool need_grid) -> (Tensor, Tensor)");
+  m.def(
+      "sample_bev_double_backward(Tensor? grad_grad_bev, Tensor? grad_grad_grid, Tensor grad, Tensor bev, "
+      "Tensor grid, bool border, bool align_corners, bool need_grad, bool need_bev, bool need_grid) -> "
+      "(Tensor, Tensor, Tensor)");
+}
+
+namespace pred {
+namespace {
+
+std::string build_info() {
+  return concat("compiler=", PRED_COMPILER, "\nbuild_type=", PRED_BUILD_TYPE, "\nsanitizers=", PRED_SANITIZERS,
+                "\nlevels=", PRED_LEVELS, "\nlevel=", isa_name(active_isa()));
+}
+
+void parallel_probe(const Tensor& out, int64_t grain, int64_t fail_at) {
+  check_cpu_tensor("parallel_probe", "out", out, 1, ScalarType::Long);
+  PRED_CHECK(out.is_contiguous(), "parallel_probe: out must be contiguous");
+  static std::atomic<int64_t> next_id{0};
+  thread_local const int64_t id = next_id++;
+  int64_t* data = out.mutable_data_ptr<int64_t>();
+  parallel(out.size(0), grain, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      PRED_CHECK(i != fail_at, "parallel_probe: index ", i, " was asked to fail");
+      data[i] = id;
+    }
+  });
+}
+
+}  // namespace
+}  // namespace pred
+
+STABLE_TORCH_LIBRARY_IMPL(pred, CompositeExplicitAutograd, m) { m.impl("build_info", TORCH_BOX(&pred::build_info)); }
+STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) { m.impl("parallel_probe", TORCH_BOX(&pred::parallel_probe)); }
