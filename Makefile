@@ -59,8 +59,8 @@ sanitize: $(VENV)/dev.stamp
 	PRED_SANITIZE=address,undefined PRED_REQUIRE_NATIVE=1 $(PIP) install --no-deps --no-build-isolation --target $(SANITIZE) .
 	export PYTHONPATH=$(SANITIZE):$(CURDIR) PRED_REQUIRE_NATIVE=1 ASAN_OPTIONS=detect_leaks=0 \
 		LD_PRELOAD="$$(g++ -print-file-name=libasan.so):$$(g++ -print-file-name=libubsan.so)"; \
-	$(BIN)/python -P -c "from pred._native import native_status as s; assert s()['build']['sanitizers'], s()" && \
-	$(BIN)/pytest -p no:cacheprovider -k "not reference" tests/ops
+	cd $(SANITIZE) && $(abspath $(BIN))/python -c "from pred._native import native_status as s; assert s()['build']['sanitizers'], s()" && \
+	cd $(CURDIR) && $(BIN)/pytest -p no:cacheprovider -k "not reference" tests/ops
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .

@@ -39,9 +39,9 @@ void parallel_probe(const Tensor& out, int64_t grain, int64_t fail_at) {
   check_cpu_tensor("parallel_probe", "out", out, 1, ScalarType::Long);
   PRED_CHECK(out.is_contiguous(), "parallel_probe: out must be contiguous");
   static std::atomic<int64_t> next_id{0};
-  thread_local const int64_t id = next_id++;
   int64_t* data = out.mutable_data_ptr<int64_t>();
   parallel(out.size(0), grain, [&](int64_t begin, int64_t end) {
+    thread_local const int64_t id = next_id++;
     for (int64_t i = begin; i < end; ++i) {
       PRED_CHECK(i != fail_at, "parallel_probe: index ", i, " was asked to fail");
       data[i] = id;

@@ -1,0 +1,130 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""The loader, the thread pool and the choice of backend and instruction set."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from pred import _native
+from pred.ops import sample_bev
+
+
+def test_two_threads_really_run(native: None) -> None:
+    torch.set_num_threads(2)
+    out = torch.full((64,), -1, dtype=torch.int64)
+    torch.ops.pred.parallel_probe(out, 1, -1)
+    assert out.min() >= 0 and len(out.unique()) == 2
+    torch.set_num_threads(1)
+    torch.ops.pred.parallel_probe(out, 1, -1)
+    assert len(out.unique()) == 1
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_text_of_a_workers_exception_is_kept(native: None, threads: int) -> None:
+    torch.set_num_threads(threads)
+    out = torch.zeros(64, dtype=torch.int64)
+    with pytest.raises(ValueError, match="parallel_probe: index 63 was asked to fail"):
+        torch.ops.pred.parallel_probe(out, 1, 63)
+
+
+def test_direct_calls_are_checked(native: None) -> None:
+    bev, grid = torch.zeros(1, 2, 3, 4), torch.zeros(1, 5, 2)
+    with pytest.raises(ValueError, match=r"sample_bev: grid must have shape \[1, N, 2\], got \[2, 5, 2\]"):
+        torch.ops.pred.sample_bev(bev, grid.expand(2, -1, -1), False, False)
+    with pytest.raises(ValueError, match="sample_bev: dtype must be float32 or float64"):
+        torch.ops.pred.sample_bev(bev.half(), grid.half(), False, False)
+
+
+def test_unknown_backend(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PRED_BACKEND", "fast")
+    with pytest.raises(ValueError, match="PRED_BACKEND must be auto, native or reference, got 'fast'"):
+        sample_bev(torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 2))
+
+
+def test_unknown_instruction_set(native: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PRED_CPU_CAPABILITY", "sse9")
+    with pytest.raises(ValueError, match="PRED_CPU_CAPABILITY must be one of default, avx2, .*, got sse9"):
+        sample_bev(torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 2))
+
+
+def test_other_devices_take_the_reference_with_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PRED_BACKEND", "auto")
+    monkeypatch.setattr(_native, "_MISSING", None)
+    monkeypatch.setattr(_native, "_warned_cuda", set())
+    bev, grid = torch.zeros(1, 1, 1, 1, device="meta"), torch.zeros(1, 1, 2, device="meta")
+    with pytest.warns(RuntimeWarning, match="sample_bev: no meta kernel yet; the PyTorch reference is used"):
+        assert not _native.use_native("sample_bev", bev)
+    assert not _native.use_native("sample_bev", bev)  # a second warning would be an error
+    monkeypatch.setenv("PRED_BACKEND", "native")
+    with pytest.raises(RuntimeError, match="sample_bev: PRED_BACKEND=native, but there is no kernel for device 'meta'"):
+        sample_bev(bev, grid)
+
+
+def test_status_names_the_level_in_force(level: str) -> None:
+    status = _native.native_status()
+    assert status["available"] and status["reason"] is None
+    assert status["cpu_capability"] == level
+    assert level in status["build"]["levels"].split(",")
+
+
+PURE_PYTHON = """
+import warnings
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    import torch
+    from pred import _native
+    from pred.ops import composite_rays, resample_rays, sample_bev, sdf_to_alpha, segment_reduce, voxelize
+    assert not _native.available()
+texts = [str(w.message) for w in caught if "compiled kernels are missing" in str(w.message)]
+assert len(texts) == 1 and "never built" in texts[0] and "--no-build-isolation" in texts[0], texts
+points = torch.tensor([[0.5, 0.5, 0.5], [9.0, 0.0, 0.0]])
+voxels = voxelize(points, torch.tensor([0, 2]), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 2.0, 2.0, 2.0))
+assert voxels.point_to_voxel.tolist() == [0, -1]
+assert segment_reduce(points, torch.tensor([0, -1]), 1, "sum").tolist() == [[0.5, 0.5, 0.5]]
+assert sample_bev(torch.ones(1, 1, 2, 2), torch.zeros(1, 1, 2)).item() == 1.0
+sdf = torch.tensor([[1.0, -1.0]], requires_grad=True)
+t = torch.tensor([[1.0, 2.0]])
+out = composite_rays(sdf, 2.7, t)
+out.depth.sum().backward()
+assert sdf.grad.isfinite().all() and sdf.grad.any()
+assert torch.equal(sdf_to_alpha(sdf, 2.7)[:, 1], torch.zeros(1))
+assert resample_rays(t, out.weights.detach(), 2).shape == (1, 4)
+print("pure python works")
+"""
+
+
+def test_pure_python_package_works(tmp_path: Path) -> None:
+    """Without libraries every op runs on its reference, with one warning that names the reason and the cure."""
+    source = Path(_native.__file__).parent
+    for path in source.rglob("*.py"):
+        target = tmp_path / "pred" / path.relative_to(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(path.read_bytes())
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PRED_")}
+    environment["PYTHONPATH"] = str(tmp_path)
+    result = subprocess.run(
+        [sys.executable, "-c", PURE_PYTHON], env=environment, cwd=tmp_path, capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == "pure python works"
+    environment["PRED_BACKEND"] = "native"
+    failing = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "import torch, pred.ops as o; o.sample_bev(torch.ones(1, 1, 1, 1), torch.ones(1, 1, 2))",
+        ],
+        env=environment,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert failing.returncode != 0
+    assert "PRED_BACKEND=native, but the compiled kernels are missing (the package was never built)" in failing.stderr
