@@ -1,0 +1,166 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""A LiDAR and six cameras modelled on the nuScenes car, looking at a ray-cast scene.
+
+Nothing moves during a sweep, and all sensors measure at the same time. The ego car itself is not modelled: there are
+no returns from it, and no camera sees it.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pred.data.frame import Camera, invert_rigid
+from pred.data.world.scene import Scene
+
+NUM_RINGS, NUM_COLUMNS = 32, 1085
+LOWEST_RING_DEG, HIGHEST_RING_DEG = -30.67, 10.67
+MAX_RANGE_M = 105.0
+RANGE_NOISE_M = 0.02
+DROPOUT = 0.10
+"""Share of the returns that are lost. With the rays that meet the sky, 15 to 20 % of a sweep is missing."""
+MIN_RANGE_M = 0.5
+
+# The LiDAR stands 1.84 m above the road; its x axis points to the car's right, its y axis ahead.
+T_EGO_FROM_LIDAR = np.array([[0.0, 1.0, 0.0, 0.94], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.84], [0.0, 0.0, 0.0, 1.0]])
+
+
+class Mount(NamedTuple):
+    """Place and optics of a camera: metres in the ego frame, yaw counter-clockwise from ahead, focal length in pixels
+    of a 1600-pixel wide image."""
+
+    name: str
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_deg: float
+    focal_px: float
+
+
+MOUNTS = (
+    Mount("CAM_FRONT", 1.70, 0.0, 1.50, 0.0, 1266.0),
+    Mount("CAM_FRONT_RIGHT", 1.55, -0.50, 1.50, -55.0, 1266.0),
+    Mount("CAM_BACK_RIGHT", 1.05, -0.50, 1.55, -110.0, 1266.0),
+    Mount("CAM_BACK", 0.0, 0.0, 1.55, 180.0, 809.0),
+    Mount("CAM_BACK_LEFT", 1.05, 0.50, 1.55, 110.0, 1266.0),
+    Mount("CAM_FRONT_LEFT", 1.55, 0.50, 1.50, 55.0, 1266.0),
+)
+MOUNT_IMAGE_WIDTH = 1600
+
+
+class Sweep(NamedTuple):
+    """Returns of one LiDAR revolution, column by column.
+
+    Attributes:
+        points: [N, 5] float32: x, y, z in metres (LiDAR frame), intensity (integers 0 to 255), 0.
+        ray_index: [N] int64, column * 32 + ring; ring 0 is the lowest.
+        class_id: [N] uint8, Cityscapes train id of what the beam met.
+    """
+
+    points: NDArray[np.float32]
+    ray_index: NDArray[np.int64]
+    class_id: NDArray[np.uint8]
+
+
+@lru_cache(maxsize=1)
+def lidar_directions() -> NDArray[np.float64]:
+    """[32 * 1085, 3] unit directions in the LiDAR frame: columns clockwise from the left, rings upwards."""
+    azimuth = np.pi - 2 * np.pi * np.arange(NUM_COLUMNS) / NUM_COLUMNS
+    elevation = np.deg2rad(np.linspace(LOWEST_RING_DEG, HIGHEST_RING_DEG, NUM_RINGS))
+    azimuth, elevation = (angle.ravel() for angle in np.meshgrid(azimuth, elevation, indexing="ij"))
+    flat = np.cos(elevation)
+    directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
+    directions.flags.writeable = False
+    return directions
+
+
+def scan(scene: Scene, T_world_from_lidar: NDArray[np.float64], rng: np.random.Generator) -> Sweep:
+    """One revolution: range noise, drop-outs, intensity by material and angle; misses are left out."""
+    directions = lidar_directions()
+    directions_world = (directions @ T_world_from_lidar[:3, :3].T).astype(np.float32)
+    hits = scene.cast(T_world_from_lidar[:3, 3].astype(np.float32), directions_world)
+    # Drawn for all rays, so that a ray's noise does not depend on what the others meet.
+    noise_m, kept, speckle = (
+        rng.normal(0.0, RANGE_NOISE_M, len(directions)),
+        rng.random(len(directions)) >= DROPOUT,
+        rng.normal(1.0, 0.1, len(directions)),
+    )
+    (ray_index,) = np.nonzero(kept & (hits.t_m > MIN_RANGE_M) & (hits.t_m < MAX_RANGE_M))
+    range_m = hits.t_m[ray_index] + noise_m[ray_index]
+    cosine = -np.einsum("nc,nc->n", hits.normal[ray_index], directions_world[ray_index])
+    returned = scene.reflectances[hits.face[ray_index]] * (0.2 + 0.8 * cosine) * speckle[ray_index]
+    points = np.zeros((len(ray_index), 5), dtype=np.float32)
+    points[:, :3] = directions[ray_index] * range_m[:, None]
+    points[:, 3] = np.rint(255 * returned).clip(0, 255)
+    return Sweep(points, ray_index, hits.class_id[ray_index])
+
+
+def mounted_camera(mount: Mount, width: int, height: int) -> Camera:
+    """The camera of a mount, its intrinsics scaled to the width of the image, without picture or labels."""
+    yaw = np.deg2rad(mount.yaw_deg)
+    c, s = np.cos(yaw), np.sin(yaw)
+    T_ego_from_camera = np.eye(4)
+    # Columns: the camera's x (right), y (down) and z (ahead) axes.
+    T_ego_from_camera[:3, :3] = [[s, 0.0, c], [-c, 0.0, s], [0.0, -1.0, 0.0]]
+    T_ego_from_camera[:3, 3] = mount.x_m, mount.y_m, mount.z_m
+    focal_px = mount.focal_px * width / MOUNT_IMAGE_WIDTH
+    intrinsics = np.array([[focal_px, 0.0, width / 2], [0.0, focal_px, height / 2], [0.0, 0.0, 1.0]])
+    T_camera_from_lidar = invert_rigid(T_ego_from_camera) @ T_EGO_FROM_LIDAR
+    return Camera(mount.name, intrinsics, T_camera_from_lidar, width, height)
+
+
+def camera_rays(
+    camera: Camera, T_world_from_lidar: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Origin [3] and unit directions [height * width, 3] of the rays through the pixel centres, world frame."""
+    T_world_from_camera = T_world_from_lidar @ camera.T_lidar_from_camera
+    v, u = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
+    pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
+    to_world = T_world_from_camera[:3, :3] @ np.linalg.inv(camera.intrinsics)
+    directions = pixels @ to_world.T
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return T_world_from_camera[:3, 3].astype(np.float32), directions.astype(np.float32)
+
+
+def render_labels(scene: Scene, camera: Camera, T_world_from_lidar: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Exact class of every pixel, uint8 [height, width], Cityscapes train ids including sky."""
+    hits = scene.cast(*camera_rays(camera, T_world_from_lidar))
+    return hits.class_id.reshape(camera.height, camera.width)
+
+
+def render_image(
+    scene: Scene,
+    camera: Camera,
+    T_world_from_lidar: NDArray[np.float64],
+    sun: NDArray[np.float32],  # [3] unit vector towards the sun, world frame
+) -> NDArray[np.uint8]:
+    """Picture, uint8 [height, width, 3]: Lambert shading with cast shadows, haze and a sky gradient."""
+    origin, directions = camera_rays(camera, T_world_from_lidar)
+    hits = scene.cast(origin, directions)
+    up = directions[:, 2:].clip(0, 1)
+    sky = _HORIZON + (_ZENITH - _HORIZON) * np.sqrt(up)
+    (solid,) = np.nonzero(hits.face >= 0)
+    normal, t_m = hits.normal[solid], hits.t_m[solid, None]
+    # A little off the surface, or it would shade itself.
+    places = origin + directions[solid] * t_m + normal * np.float32(0.01)
+    facing = (normal @ sun).clip(0, 1)
+    lit = np.flatnonzero(facing)
+    towards_sun = np.broadcast_to(sun, (len(lit), 3))
+    facing[lit[scene.occluded(places[lit], towards_sun)]] = 0
+    light = _AMBIENT * (1 + 0.25 * normal[:, 2:]) + _SUNLIGHT * facing[:, None]
+    haze = 1 - np.exp(-t_m / _VISIBILITY_M)
+    image = sky.copy()
+    image[solid] = scene.colours[hits.face[solid]] * light * (1 - haze) + _HORIZON * haze
+    pixels = np.rint(255 * image.clip(0, 1)).astype(np.uint8)
+    return pixels.reshape(camera.height, camera.width, 3)
+
+
+_HORIZON = np.array([0.82, 0.88, 0.94], dtype=np.float32)
+_ZENITH = np.array([0.30, 0.52, 0.84], dtype=np.float32)
+_AMBIENT = np.array([0.50, 0.53, 0.60], dtype=np.float32)
+_SUNLIGHT = np.array([0.68, 0.64, 0.56], dtype=np.float32)
+_VISIBILITY_M = np.float32(400.0)
