@@ -18,7 +18,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 NATIVE := $(shell find csrc -type f) CMakeLists.txt setup.py
 # What nuscenes-devkit imports when its tables and geometry are used; its numpy<2 pin is left aside.
-DEVKIT := cachetools descartes fire matplotlib opencv-python-headless pyquaternion scikit-learn shapely tqdm
+DEVKIT := cachetools matplotlib opencv-python-headless pyquaternion scikit-learn tqdm
 
 .PHONY: demo test sanitize lint format bench clean
 .DELETE_ON_ERROR:

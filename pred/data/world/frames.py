@@ -6,7 +6,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,9 +106,7 @@ class StreetFrames:
         width, height = self.config.image_width, self.config.image_height
         camera = sensors.mounted_camera(sensors.MOUNTS[mount], width, height)
         camera.image = partial(self._render_image, index, camera)
-        # A label is an array by contract; this stand-in becomes one when it is read.
-        labels = cast(NDArray[np.uint8], _LazyLabels(self, index, mount))
-        camera.labels = PseudoLabel(labels, width, height)
+        camera.labels = PseudoLabel(partial(self._labels, index, mount), width, height)
         return camera
 
     def _render_image(self, index: int, camera: Camera) -> NDArray[np.uint8]:
@@ -122,16 +120,3 @@ class StreetFrames:
         labels = sensors.render_labels(street.scene, camera, T_world_from_lidar)
         labels.flags.writeable = False  # shared through the cache
         return labels
-
-
-@dataclass(frozen=True)
-class _LazyLabels:
-    """Label map that is rendered when NumPy asks for it."""
-
-    frames: StreetFrames
-    index: int
-    mount: int
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[np.uint8]:
-        labels = self.frames._labels(self.index, self.mount)
-        return labels.astype(dtype) if dtype is not None or copy else labels

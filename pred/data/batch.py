@@ -1,0 +1,500 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""Training batches as a function of the step: visible points, depth rays and semantic rays."""
+
+# No `from __future__ import annotations`: jsonargparse reads the field types of DataConfig.
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from rich.progress import track
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from pred.data.frame import NUM_CLASSES, Frame, FrameError, FrameSource
+from pred.data.masking import visible_points
+from pred.data.nuscenes import NuScenesFrames
+from pred.data.rays import (
+    DepthCandidates,
+    FrameCandidates,
+    SemanticCandidates,
+    draw_class_balanced,
+    draw_uniform,
+    frame_candidates,
+    join_cameras,
+)
+from pred.data.world import StreetConfig
+from pred.random import numpy_generator
+
+PointRange = tuple[float, float, float, float, float, float]
+"""(x_min, y_min, z_min, x_max, y_max, z_max), metres, LiDAR frame."""
+
+CACHED_FRAMES = 32
+"""Data sets of at most so many frames are kept in memory: 3 to 8 MB per frame and worker."""
+
+WORKER_START = "fork" if sys.platform == "linux" else None
+"""Forked workers share the tables of a data set."""
+
+UPWARDS = (0.0, 0.0, 1.0)
+
+T = TypeVar("T")
+TensorHolder = TypeVar("TensorHolder", bound="Rays | Batch")
+
+
+@dataclass
+class DataConfig:
+    """What is read, what is hidden from the encoder, and how many rays are drawn."""
+
+    dataset: Literal["street", "nuscenes"] = "nuscenes"
+    """Procedural street, or the official nuScenes layout under `root`."""
+    root: str | None = None
+    """Folder of the data set (nuscenes only)."""
+    version: str | None = None
+    """Table folder under `root`; None: the only folder named like v1.0-*."""
+    split: str | None = None
+    """Name in the version's splits.json or an official split name; None: every sample."""
+    sweeps: int = 10
+    """LiDAR sweeps per frame, the keyframe's own included; fewer where a scene starts."""
+    labels: str | None = "auto"
+    """Folder under `root` with <CAMERA>/<image stem>.png|.npy|.npz; auto: the only folder under
+    pseudo/; none (or no such folder): LiDAR-only."""
+    batch_size: int = 4
+    """Frames per batch and process."""
+    mask_ratio: float = 0.95
+    """Share of the points inside the range that the encoder does not see, in [0, 1)."""
+    holdout_fraction: float = 0.1
+    """Share of the keyframe returns that training never uses, neither as input nor as target."""
+    ego_box: tuple[float, float, float, float] = (-1.0, -2.0, 1.0, 3.0)
+    """Returns of the own car: (x_min, y_min, x_max, y_max), metres, LiDAR frame."""
+    semantic_rays_per_camera: int = 512
+    """Semantic rays drawn for every camera image."""
+    depth_rays: int = 3072
+    """Depth rays drawn for every frame."""
+    depth_view: Literal["lidar", "image"] = "lidar"
+    """Depth rays start at the LiDAR (target: range) or at the cameras (target: z-depth)."""
+    class_counts: Literal["batch", "dataset"] = "batch"
+    """Where class frequencies for balanced sampling are counted; dataset reads every frame once."""
+    on_error: Literal["raise", "skip"] = "raise"
+    """Broken frame: stop with an error naming the file, or take the next frame and count it."""
+    workers: int = 2
+    """Loader processes; 0 loads in the training process."""
+    street: StreetConfig = field(default_factory=StreetConfig)
+    """The procedural street (street only)."""
+
+    def __post_init__(self) -> None:
+        if self.dataset == "nuscenes" and self.root == "":
+            raise ValueError("data.root must name a folder, got an empty string")
+        for name in ("sweeps", "batch_size", "semantic_rays_per_camera", "depth_rays"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"data.{name} must be at least 1, got {getattr(self, name)}")
+        if self.workers < 0:
+            raise ValueError(f"data.workers must be at least 0, got {self.workers}")
+        for name in ("mask_ratio", "holdout_fraction"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise ValueError(f"data.{name} must be in [0, 1), got {getattr(self, name)}")
+        x_min, y_min, x_max, y_max = self.ego_box
+        if not (x_min <= x_max and y_min <= y_max):
+            raise ValueError(f"data.ego_box must be (x_min, y_min, x_max, y_max), got {self.ego_box}")
+
+
+@dataclass
+class Rays:
+    """R rays for each of B frames, in the frames' LiDAR coordinates.
+
+    Attributes:
+        origins: [B, R, 3] float32, metres.
+        directions: [B, R, 3] float32, unit length.
+        valid: [B, R] bool; other rays hold finite placeholders and must not count in any loss.
+        jitter: [B, R] float32 in [0, 1), shift of the stratified samples along the ray.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    valid: Tensor
+    jitter: Tensor
+
+
+@dataclass
+class DepthRays(Rays):
+    """Rays towards LiDAR returns.
+
+    Attributes:
+        depth_m: [B, R] float32, the measured depth, to be compared with ``t * depth_factor``.
+        depth_factor: [B, R] float32; 1 in the LiDAR view (depth is range), the direction's
+            component along the optical axis in the image view (depth is z-depth).
+    """
+
+    depth_m: Tensor
+    depth_factor: Tensor
+
+
+@dataclass
+class SemanticRays(Rays):
+    """Rays from cameras through projected LiDAR returns.
+
+    Attributes:
+        target: [B, R, 19] float32 class probabilities of the pseudo label at the pixel.
+        confidence: [B, R] float32, the largest of them; 1 for hard labels.
+    """
+
+    target: Tensor
+    confidence: Tensor
+
+
+@dataclass
+class Batch:
+    """One training step's data.
+
+    Attributes:
+        step: training step.
+        tokens: B frame tokens.
+        points: [N, 5] float32 visible points of all frames: x, y, z, intensity, dt.
+        point_offsets: [B + 1] int64, frame b owns points[point_offsets[b]:point_offsets[b + 1]].
+        depth: depth rays.
+        semantic: semantic rays; None without pseudo labels.
+        skipped: token -> error text of the broken frames that were replaced in this batch.
+    """
+
+    step: int
+    tokens: list[str]
+    points: Tensor
+    point_offsets: Tensor
+    depth: DepthRays
+    semantic: SemanticRays | None
+    skipped: dict[str, str]
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
+        """The batch on another device."""
+        return _map_tensors(self, lambda tensor: tensor.to(device, non_blocking=non_blocking))
+
+    def pin_memory(self) -> "Batch":
+        """The batch in page-locked memory (called by a DataLoader with ``pin_memory=True``)."""
+        return _map_tensors(self, lambda tensor: tensor.pin_memory())
+
+
+class TrainingBatches(Dataset[Batch]):
+    """Batch of every training step, as a function of the step alone.
+
+    Frames are visited in a new random order each epoch. Worker count, start step and earlier calls
+    change nothing: all randomness comes from `pred.random` with the key (slot, token, purpose),
+    where a slot is one frame's place in the whole run, ``step * batch_size * world_size + ...``.
+
+    Args:
+        config: what to read and to draw.
+        point_range: (x_min, y_min, z_min, x_max, y_max, z_max), metres, LiDAR frame.
+        seed: seed of order, masks and rays.
+        total_steps: number of steps of the run.
+        rank, world_size: this process among those that train together; they share out the slots.
+        source: frames; None builds what ``config`` names.
+    """
+
+    def __init__(
+        self,
+        config: DataConfig,
+        point_range: PointRange,
+        seed: int,
+        total_steps: int,
+        rank: int = 0,
+        world_size: int = 1,
+        source: FrameSource | None = None,
+    ) -> None:
+        self.config = config
+        self.point_range = point_range
+        self.seed = seed
+        self.total_steps = total_steps
+        self.rank = rank
+        self.world_size = world_size
+        self.source = build_source(config) if source is None else source
+        if self.num_frames == 0:
+            raise ValueError("source must hold at least one frame, got none")
+        self._cache: dict[int, FrameCandidates] = {}
+        self._class_counts: NDArray[np.int64] | None = None
+        if config.class_counts == "dataset":
+            self._class_counts = count_classes(self.source, config, point_range, rank == 0)
+
+    @property
+    def num_frames(self) -> int:
+        """Frames in the data set."""
+        return len(self.source)
+
+    def __len__(self) -> int:
+        return self.total_steps
+
+    def __getitem__(self, step: int) -> Batch:
+        if not 0 <= step < self.total_steps:
+            raise IndexError(f"step must be in [0, {self.total_steps}), got {step}")
+        first = (step * self.world_size + self.rank) * self.config.batch_size
+        slots = range(first, first + self.config.batch_size)
+        skipped: dict[str, str] = {}
+        frames = [self._good_frame(slot, skipped) for slot in slots]
+        class_counts = self._class_counts
+        if class_counts is None:
+            class_counts = np.sum([frame.class_counts() for frame in frames], axis=0)
+        draws = [
+            _draw(frame, class_counts, self.config, self.seed, slot) for frame, slot in zip(frames, slots, strict=True)
+        ]
+        num_cameras = max(len(frame.semantic) for frame in frames)
+        return _collate(
+            step,
+            draws,
+            num_depth_rays=self.config.depth_rays,
+            num_semantic_rays=self.config.semantic_rays_per_camera * num_cameras,
+            skipped=skipped,
+        )
+
+    def _good_frame(self, slot: int, skipped: dict[str, str]) -> FrameCandidates:
+        """The frame of a slot, or the next one of the epoch that can be read (``on_error``)."""
+        epoch, position = divmod(slot, self.num_frames)
+        order = numpy_generator(self.seed, epoch, "frame order").permutation(self.num_frames)
+        for ahead in range(self.num_frames):
+            index = int(order[(position + ahead) % self.num_frames])
+            try:
+                return self._candidates(index)
+            except FrameError as error:
+                if self.config.on_error == "raise":
+                    raise
+                skipped[self.source.token(index)] = str(error)
+                last_error = error
+        raise FrameError(
+            last_error.path,
+            f"{last_error.what}; no frame is left: all {self.num_frames} are broken",
+        )
+
+    def _candidates(self, index: int) -> FrameCandidates:
+        if index in self._cache:
+            return self._cache[index]
+        candidates = _candidates(self.source.load(index), self.config, self.point_range)
+        if self.num_frames <= CACHED_FRAMES:
+            self._cache[index] = candidates
+        return candidates
+
+
+def make_loader(dataset: TrainingBatches, start_step: int = 0, workers: int = 0) -> DataLoader[Batch]:
+    """Batches of ``start_step`` and later in order; ``workers`` processes, 0 loads in this one."""
+    return DataLoader(
+        dataset,
+        batch_size=None,
+        sampler=range(start_step, len(dataset)),
+        num_workers=workers,
+        multiprocessing_context=WORKER_START if workers else None,
+        collate_fn=_unchanged,
+        pin_memory=torch.cuda.is_available(),
+    )
+
+
+def build_source(config: DataConfig) -> FrameSource:
+    """The frames that ``config`` names.
+
+    Raises:
+        FrameError, ValueError: they cannot be found.
+    """
+    if config.dataset == "street":
+        # Simulation needs a ray caster that readers of real data do not.
+        from pred.data.world import StreetFrames
+
+        return StreetFrames(config.street)
+    if config.root is None:
+        raise ValueError("data.root must name the folder of the data set, got None")
+    return NuScenesFrames(
+        config.root,
+        version=config.version,
+        split=config.split,
+        sweeps=config.sweeps,
+        labels=config.labels,
+        ego_box=config.ego_box,
+    )
+
+
+def count_classes(
+    source: FrameSource, config: DataConfig, point_range: PointRange, show_progress: bool = True
+) -> NDArray[np.int64]:
+    """[19] semantic candidates of each class in the whole data set; reads every frame once.
+
+    Raises:
+        FrameError: a frame is broken and ``config.on_error`` is "raise".
+    """
+    loader: DataLoader[NDArray[np.int64]] = DataLoader(
+        _ClassCounts(source, config, point_range),
+        batch_size=None,
+        num_workers=config.workers,
+        multiprocessing_context=WORKER_START if config.workers else None,
+        collate_fn=_unchanged,
+    )
+    counts = np.zeros(NUM_CLASSES, dtype=np.int64)
+    for frame_counts in track(loader, "counting classes", len(source), disable=not show_progress):
+        counts += frame_counts
+    return counts
+
+
+def evaluation_batch(frame: Frame, config: DataConfig, point_range: PointRange, seed: int) -> Batch:
+    """Batch of one frame whose rays aim at all held-out returns, each once.
+
+    The visible points are a fixed mask of ``seed`` and the frame. Depth rays are those of the LiDAR
+    view; a return that two cameras see gives two semantic rays. Jitter is 0.5 (no randomness).
+
+    Raises:
+        FrameError: a pseudo label cannot be used.
+    """
+    candidates = _candidates(frame, replace(config, depth_view="lidar"), point_range, held_out=True)
+    rng = numpy_generator(seed, frame.token, "evaluation mask")
+    visible = visible_points(len(candidates.points), config.mask_ratio, rng)
+    semantic = join_cameras(candidates.semantic)
+    draw = _Draw(
+        token=frame.token,
+        points=candidates.points[visible],
+        depth=candidates.depth,
+        depth_jitter=np.full(len(candidates.depth.depth_m), 0.5, dtype=np.float32),
+        semantic=semantic,
+        semantic_jitter=np.full(len(semantic.class_id), 0.5, dtype=np.float32),
+    )
+    has_labels = len(candidates.semantic) > 0
+    # At least one ray, so that a frame without held-out returns needs no special case later.
+    return _collate(
+        step=0,
+        draws=[draw],
+        num_depth_rays=max(1, len(draw.depth_jitter)),
+        num_semantic_rays=max(1, len(draw.semantic_jitter)) if has_labels else 0,
+        skipped={},
+    )
+
+
+class _ClassCounts(Dataset[NDArray[np.int64]]):
+    """Class counts of every frame; zeros for a broken frame that is to be skipped."""
+
+    def __init__(self, source: FrameSource, config: DataConfig, point_range: PointRange) -> None:
+        self.source = source
+        self.config = config
+        self.point_range = point_range
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __getitem__(self, index: int) -> NDArray[np.int64]:
+        try:
+            frame = self.source.load(index)
+            return _candidates(frame, self.config, self.point_range).class_counts()
+        except FrameError:
+            if self.config.on_error == "raise":
+                raise
+            return np.zeros(NUM_CLASSES, dtype=np.int64)
+
+
+class _Draw(NamedTuple):
+    """What was drawn of one frame."""
+
+    token: str
+    points: NDArray[np.float32]  # [N, 5]
+    depth: DepthCandidates
+    depth_jitter: NDArray[np.float32]
+    semantic: SemanticCandidates
+    semantic_jitter: NDArray[np.float32]
+
+
+def _candidates(frame: Frame, config: DataConfig, point_range: PointRange, held_out: bool = False) -> FrameCandidates:
+    return frame_candidates(
+        frame,
+        point_range,
+        config.ego_box,
+        config.holdout_fraction,
+        depth_view=config.depth_view,
+        held_out=held_out,
+    )
+
+
+def _draw(
+    frame: FrameCandidates,
+    class_counts: NDArray[np.int64],
+    config: DataConfig,
+    seed: int,
+    slot: int,
+) -> _Draw:
+    def rng(purpose: str) -> np.random.Generator:
+        return numpy_generator(seed, slot, frame.token, purpose)
+
+    visible = visible_points(len(frame.points), config.mask_ratio, rng("mask"))
+    depth = frame.depth
+    if len(depth.depth_m):
+        chosen = draw_uniform(len(depth.depth_m), config.depth_rays, rng("depth rays"))
+        depth = DepthCandidates._make(column[chosen] for column in depth)
+    semantic_rng = rng("semantic rays")
+    cameras = []
+    for camera in frame.semantic:
+        if len(camera.class_id):
+            chosen = draw_class_balanced(camera.class_id, class_counts, config.semantic_rays_per_camera, semantic_rng)
+            cameras.append(SemanticCandidates._make(column[chosen] for column in camera))
+    semantic = join_cameras(cameras)
+    return _Draw(
+        token=frame.token,
+        points=frame.points[visible],
+        depth=depth,
+        depth_jitter=rng("depth jitter").random(len(depth.depth_m), dtype=np.float32),
+        semantic=semantic,
+        semantic_jitter=rng("semantic jitter").random(len(semantic.class_id), dtype=np.float32),
+    )
+
+
+def _collate(
+    step: int,
+    draws: list[_Draw],
+    num_depth_rays: int,
+    num_semantic_rays: int,
+    skipped: dict[str, str],
+) -> Batch:
+    """Stack frames; missing rays become placeholders: straight up, depth 1, not valid."""
+    depth = [draw.depth for draw in draws]
+    semantic = [draw.semantic for draw in draws]
+    counts = [len(draw.points) for draw in draws]
+    return Batch(
+        step=step,
+        tokens=[draw.token for draw in draws],
+        points=torch.from_numpy(np.concatenate([draw.points for draw in draws])),
+        point_offsets=torch.from_numpy(np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)),
+        depth=DepthRays(
+            origins=_stack([rays.origins for rays in depth], num_depth_rays, 0.0),
+            directions=_stack([rays.directions for rays in depth], num_depth_rays, UPWARDS),
+            valid=_stack([np.ones(len(rays.depth_m), bool) for rays in depth], num_depth_rays, 0),
+            jitter=_stack([draw.depth_jitter for draw in draws], num_depth_rays, 0.0),
+            depth_m=_stack([rays.depth_m for rays in depth], num_depth_rays, 1.0),
+            depth_factor=_stack([rays.depth_factor for rays in depth], num_depth_rays, 1.0),
+        ),
+        semantic=None
+        if num_semantic_rays == 0
+        else SemanticRays(
+            origins=_stack([rays.origins for rays in semantic], num_semantic_rays, 0.0),
+            directions=_stack([rays.directions for rays in semantic], num_semantic_rays, UPWARDS),
+            valid=_stack([np.ones(len(rays.class_id), bool) for rays in semantic], num_semantic_rays, 0),
+            jitter=_stack([draw.semantic_jitter for draw in draws], num_semantic_rays, 0.0),
+            target=_stack([rays.target for rays in semantic], num_semantic_rays, 0.0),
+            confidence=_stack([rays.confidence for rays in semantic], num_semantic_rays, 0.0),
+        ),
+        skipped=skipped,
+    )
+
+
+def _stack(rows: list[NDArray[Any]], num_rays: int, placeholder: ArrayLike) -> Tensor:
+    """[B, num_rays, ...] from B arrays of at most num_rays rows."""
+    stacked = np.empty((len(rows), num_rays, *rows[0].shape[1:]), dtype=rows[0].dtype)
+    stacked[...] = placeholder
+    for frame, values in enumerate(rows):
+        stacked[frame, : len(values)] = values
+    return torch.from_numpy(stacked)
+
+
+def _unchanged(batch: T) -> T:
+    return batch
+
+
+def _map_tensors(holder: TensorHolder, change: Callable[[Tensor], Tensor]) -> TensorHolder:
+    changed: dict[str, Any] = {}
+    for item in fields(holder):
+        value = getattr(holder, item.name)
+        if isinstance(value, Tensor):
+            changed[item.name] = change(value)
+        elif isinstance(value, Rays):
+            changed[item.name] = _map_tensors(value, change)
+    return replace(holder, **changed)

@@ -1,0 +1,233 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""Semantic pseudo labels of images: hard class maps and per-pixel probabilities.
+
+A label map may be smaller or larger than its image (segmenters often run on a scaled copy); image
+pixels are scaled to it. It must show the whole image, so its aspect ratio must be the image's.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.lib import format as npy_format
+from numpy.typing import NDArray
+from PIL import Image
+
+from pred.data.frame import NUM_CLASSES, FrameError, open_image
+
+IGNORED_CLASS_IDS = (19, 255)
+PROBABILITIES_KEY = "probabilities"
+LABEL_SUFFIXES = (".png", ".npy", ".npz")
+MAX_PROBABILITY_SUM = 1.01  # room for float16 rounding
+
+
+class LabelLookup(NamedTuple):
+    """Labels at N pixels.
+
+    Attributes:
+        target: [N, 19] float32 class probabilities; one-hot for hard labels, zero where ignored.
+        confidence: [N] float32, the largest probability; 1 for hard labels, 0 where ignored.
+        class_id: [N] int64, the most probable class; -1 where ignored.
+    """
+
+    target: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    class_id: NDArray[np.int64]
+
+
+@dataclass
+class PseudoLabel:
+    """The pseudo label of one image; files are read when looked up.
+
+    Attributes:
+        source: ``.png`` (palette or grey, Cityscapes train ids; 19 and 255 are ignored), ``.npy``
+            or ``.npz`` (key ``probabilities``; float16 or float32 [19, h, w]); or such an array,
+            uint8 [h, w] class ids or [19, h, w] probabilities, or a function that makes it.
+        width, height: size of the image in pixels.
+    """
+
+    source: Path | NDArray[Any] | Callable[[], NDArray[Any]]
+    width: int
+    height: int
+
+    @property
+    def name(self) -> str:
+        """File name, or a description for an array in memory; opens every error text."""
+        return str(self.source) if isinstance(self.source, Path) else "pseudo label in memory"
+
+    def lookup(self, uv: NDArray[np.float64]) -> LabelLookup:
+        """Labels at image pixels ``uv`` [N, 2]: nearest label cell, pixels outside are clamped.
+
+        Of probability files only the values looked up are read and checked.
+
+        Raises:
+            FrameError: the file is missing or damaged, has a wrong type, shape or aspect ratio,
+                holds other class ids, or values that are no probabilities.
+        """
+        label_map = self._load()
+        map_height, map_width = label_map.shape[-2:]
+        column = np.floor(uv[:, 0] * (map_width / self.width)).astype(np.int64)
+        row = np.floor(uv[:, 1] * (map_height / self.height)).astype(np.int64)
+        column = column.clip(0, map_width - 1)
+        row = row.clip(0, map_height - 1)
+        if label_map.ndim == 2:
+            return _hard_lookup(label_map[row, column])
+        return self._soft_lookup(label_map[:, row, column])
+
+    def class_map(self) -> NDArray[np.uint8]:
+        """[h, w] most probable class of every label cell, 255 where ignored; raises as `lookup`."""
+        label_map = self._load()
+        if label_map.ndim == 2:
+            return np.where(label_map < NUM_CLASSES, label_map, 255).astype(np.uint8)
+        looked_up = self._soft_lookup(label_map.reshape(NUM_CLASSES, -1))
+        class_id = np.where(looked_up.class_id < 0, 255, looked_up.class_id)
+        return class_id.astype(np.uint8).reshape(label_map.shape[1:])
+
+    def _load(self) -> NDArray[Any]:
+        if not isinstance(self.source, Path):
+            label_map = np.asarray(self.source() if callable(self.source) else self.source)
+        elif self.source.suffix == ".png":
+            label_map = _read_png(self.source)
+        elif self.source.suffix == ".npy":
+            label_map = _map_npy(self.source)
+        elif self.source.suffix == ".npz":
+            label_map = _read_npz(self.source, self._check_header)
+        else:
+            raise FrameError(self.source, f"label must be one of {LABEL_SUFFIXES}")
+        self._check_header(label_map.shape, label_map.dtype)
+        if label_map.ndim == 2:
+            self._check_class_ids(label_map)
+        return label_map
+
+    def _check_header(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        hard = len(shape) == 2 and dtype == np.uint8
+        soft = len(shape) == 3 and shape[0] == NUM_CLASSES and dtype in (np.float16, np.float32)
+        if not (hard or soft) or 0 in shape:
+            raise FrameError(
+                self.name,
+                "label must be uint8 [h, w] class ids or float16/float32 "
+                f"[{NUM_CLASSES}, h, w] probabilities, got {dtype} {list(shape)}",
+            )
+        map_height, map_width = shape[-2:]
+        max_pixels = Image.MAX_IMAGE_PIXELS
+        if max_pixels is not None and map_height * map_width > max_pixels:
+            raise FrameError(self.name, f"label must have at most {max_pixels} pixels, got {list(shape)}")
+        # One label cell of tolerance: 1600 x 900 at 1/8 is 200 x 112.5.
+        if abs(map_width * self.height / self.width - map_height) > 1.0:
+            raise FrameError(
+                self.name,
+                f"label must have the aspect ratio of its {self.width} x {self.height} image, "
+                f"got {map_width} x {map_height}",
+            )
+
+    def _check_class_ids(self, label_map: NDArray[np.uint8]) -> None:
+        present = np.flatnonzero(np.bincount(label_map.ravel(), minlength=256))
+        unknown = present[(present >= NUM_CLASSES) & ~np.isin(present, IGNORED_CLASS_IDS)]
+        if len(unknown):
+            raise FrameError(
+                self.name,
+                "label must hold Cityscapes train ids 0..18, or 19 and 255 (ignored), "
+                f"got {', '.join(map(str, unknown[:8]))}",
+            )
+
+    def _soft_lookup(self, probabilities: NDArray[Any]) -> LabelLookup:
+        target = np.ascontiguousarray(probabilities.T, dtype=np.float32)  # [N, 19]
+        total = target.sum(axis=1)
+        # Written so that NaN fails.
+        good = (target >= 0).all(axis=1) & (target <= 1).all(axis=1) & (total <= MAX_PROBABILITY_SUM)
+        if not good.all():
+            worst = target[np.argmin(good)]
+            raise FrameError(
+                self.name,
+                "probabilities must be finite, in [0, 1], with a sum of at most 1, "
+                f"got min {worst.min():g}, max {worst.max():g}, sum {worst.sum():g} in one pixel",
+            )
+        confidence = target.max(axis=1, initial=0.0)
+        class_id = np.where(confidence > 0, target.argmax(axis=1), -1)
+        return LabelLookup(target, confidence, class_id)
+
+
+def find_label_file(folder: Path, stem: str) -> Path:
+    """The label file ``<folder>/<stem>`` with one of the known suffixes.
+
+    Raises:
+        FrameError: there is none.
+    """
+    for suffix in LABEL_SUFFIXES:
+        path = folder / f"{stem}{suffix}"
+        if path.is_file():
+            return path
+    raise FrameError(
+        folder / f"{stem}.png",
+        f"label file must exist as one of {LABEL_SUFFIXES}, got no such file",
+    )
+
+
+def _hard_lookup(class_ids: NDArray[np.uint8]) -> LabelLookup:
+    labelled = class_ids < NUM_CLASSES
+    target = np.zeros((len(class_ids), NUM_CLASSES), dtype=np.float32)
+    target[np.flatnonzero(labelled), class_ids[labelled]] = 1.0
+    class_id = np.where(labelled, class_ids.astype(np.int64), -1)
+    return LabelLookup(target, labelled.astype(np.float32), class_id)
+
+
+def _read_png(path: Path) -> NDArray[np.uint8]:
+    with open_image(path) as image:
+        if image.format != "PNG" or image.mode not in ("P", "L"):
+            raise FrameError(
+                path,
+                f"label must be a PNG of mode P (palette) or L (8-bit grey), got {image.format} of mode {image.mode}",
+            )
+        return np.asarray(image)
+
+
+def _map_npy(path: Path) -> NDArray[Any]:
+    """Memory-map: only the pages that are looked up get read. Pickles are refused."""
+    try:
+        return npy_format.open_memmap(path, mode="r")
+    except FileNotFoundError:
+        raise FrameError(path, "label file must exist, got no such file") from None
+    # A damaged header surfaces as ValueError, OSError, SyntaxError, EOFError, OverflowError, ...
+    except Exception as error:
+        raise FrameError(path, _unreadable(".npy", error)) from None
+
+
+def _read_npz(path: Path, check_header: Callable[[tuple[int, ...], np.dtype[Any]], None]) -> NDArray[Any]:
+    member = f"{PROBABILITIES_KEY}.npy"
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if member not in archive.namelist():
+                raise FrameError(path, f"must hold the key {PROBABILITIES_KEY!r}, got {archive.namelist()}")
+            # The claimed size is checked before anything is allocated for it.
+            with archive.open(member) as stream:
+                check_header(*_npy_header(stream))
+            with archive.open(member) as stream:
+                return npy_format.read_array(stream, allow_pickle=False)
+    except FrameError:
+        raise
+    except FileNotFoundError:
+        raise FrameError(path, "label file must exist, got no such file") from None
+    # Damage surfaces as BadZipFile, zlib.error, ValueError, OSError, EOFError, ...
+    except Exception as error:
+        raise FrameError(path, _unreadable(".npz", error)) from None
+
+
+def _npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    version = npy_format.read_magic(stream)
+    if version == (1, 0):
+        shape, _, dtype = npy_format.read_array_header_1_0(stream)
+    elif version == (2, 0):
+        shape, _, dtype = npy_format.read_array_header_2_0(stream)
+    else:
+        raise ValueError(f"unsupported .npy version {version}")
+    return shape, dtype
+
+
+def _unreadable(kind: str, error: Exception) -> str:
+    return f"label must be a readable {kind} file, got {type(error).__name__}: {error}"

@@ -1,0 +1,54 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""Placing one LiDAR sweep in the keyframe's frame: the inner loop of loader workers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pred.data.frame import outside_ego_box, transform_points
+
+try:
+    from pred import _host
+except ImportError:  # built for another Python version, or not at all
+    _host = None  # type: ignore[assignment]
+
+
+def place_sweep(
+    points: NDArray[np.float32],
+    T_keyframe_from_sweep: NDArray[np.float64],
+    ego_box: tuple[float, float, float, float],
+    lag_s: float,
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Drops the own car's returns from a sweep and moves the rest to the keyframe's LiDAR frame.
+
+    Args:
+        points: [N, >= 4] float32 x, y, z, intensity in the sweep's own LiDAR frame, metres.
+        T_keyframe_from_sweep: [4, 4] rigid transform.
+        ego_box: (x_min, y_min, x_max, y_max) of the own car in the sweep's frame, metres.
+        lag_s: age of the sweep, seconds behind the keyframe.
+
+    Returns:
+        [M, 5] float32 x, y, z, intensity, lag, and [M] int64 row in ``points``; order is kept. Compiled where
+        ``pred._host`` is there; the NumPy form differs in the last bit of moved coordinates.
+    """
+    if _host is not None:
+        placed, kept = _host.place_sweep(points, T_keyframe_from_sweep, np.asarray(ego_box), lag_s)
+        return placed, kept
+    return place_sweep_reference(points, T_keyframe_from_sweep, ego_box, lag_s)
+
+
+def place_sweep_reference(
+    points: NDArray[np.float32],
+    T_keyframe_from_sweep: NDArray[np.float64],
+    ego_box: tuple[float, float, float, float],
+    lag_s: float,
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """NumPy form of `place_sweep`."""
+    kept = np.flatnonzero(outside_ego_box(points, ego_box))
+    placed = np.empty((len(kept), 5), dtype=np.float32)
+    placed[:, :3] = transform_points(T_keyframe_from_sweep, points[kept, :3])
+    placed[:, 3] = points[kept, 3]
+    placed[:, 4] = lag_s
+    return placed, kept
