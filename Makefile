@@ -77,4 +77,4 @@ bench: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks
 
 clean:
-	rm -rf build $(VENV) pred/libpred_* pred/_host* pred/build_info.json
+	rm -rf build $(VENV) pred/libpred_* pred/_host*.so pred/build_info.json

@@ -94,7 +94,7 @@ class CMakeBuild(build_ext):
         except MissingToolError as reason:
             if os.environ.get("PRED_REQUIRE_NATIVE") == "1":
                 raise SystemExit(f"PRED_REQUIRE_NATIVE=1, but {reason}") from None
-            for stale in (*package.glob("libpred_*"), *package.glob("_host*")):
+            for stale in (*package.glob("libpred_*"), *package.glob("_host*.so")):
                 stale.unlink()
             record = {"native": False, "reason": str(reason)}
         (package / "build_info.json").write_text(json.dumps(record, indent=1) + "\n")
@@ -131,7 +131,7 @@ class CMakeBuild(build_ext):
 
     def get_outputs(self) -> list[str]:
         package = Path(self.build_lib) / "pred"
-        return [str(path) for pattern in ("libpred_*", "_host*", "build_info.json") for path in package.glob(pattern)]
+        return [str(path) for pattern in ("libpred_*", "_host*.so", "build_info.json") for path in package.glob(pattern)]
 
     def get_output_mapping(self) -> dict[str, str]:
         return {}
