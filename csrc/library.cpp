@@ -25,6 +25,28 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "sample_bev_double_backward(Tensor? grad_grad_bev, Tensor? grad_grad_grid, Tensor grad, Tensor bev, "
       "Tensor grid, bool border, bool align_corners, bool need_grad, bool need_bev, bool need_grid) -> "
       "(Tensor, Tensor, Tensor)");
+
+  m.def("segment_reduce(Tensor features, Tensor index, SymInt num_segments, str reduce) -> (Tensor, Tensor)");
+  m.def("segment_reduce_backward(Tensor grad, Tensor index, Tensor saved, str reduce) -> Tensor");
+
+  m.def(
+      "voxelize(Tensor points, Tensor batch_offsets, float[] voxel_size, float[] point_range, int[] grid_size) -> "
+      "(Tensor, Tensor, Tensor)");
+
+  m.def("sdf_to_alpha(Tensor sdf, Tensor inv_s, bool last_opaque) -> Tensor");
+  m.def(
+      "sdf_to_alpha_backward(Tensor grad, Tensor sdf, Tensor inv_s, bool need_sdf, bool need_inv_s) -> "
+      "(Tensor, Tensor)");
+
+  m.def(
+      "composite_rays(Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, bool depth_mid, bool last_opaque) -> "
+      "(Tensor, Tensor, Tensor, Tensor)");
+  m.def(
+      "composite_rays_backward(Tensor? grad_weights, Tensor? grad_depth, Tensor? grad_opacity, Tensor? grad_values, "
+      "Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, Tensor? weights, bool depth_mid, bool last_opaque, "
+      "bool need_sdf, bool need_inv_s, bool need_t, bool need_values) -> (Tensor, Tensor, Tensor, Tensor)");
+
+  m.def("resample_rays(Tensor t, Tensor weights, Tensor u) -> Tensor");
 }
 
 namespace pred {

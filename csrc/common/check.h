@@ -11,6 +11,7 @@
 #include <sstream>
 #include <stdexcept>
 #include <string>
+#include <vector>
 
 namespace pred {
 
@@ -41,6 +42,13 @@ inline void check_cpu_tensor(const char* op, const char* name, const Tensor& ten
   PRED_CHECK(tensor.is_cpu(), op, ": ", name, " must be a CPU tensor");
   PRED_CHECK(tensor.dim() == dim, op, ": ", name, " must have ", dim, " dimensions, got shape ", shape_text(tensor));
   PRED_CHECK(tensor.scalar_type() == dtype, op, ": ", name, " must have the dtype of the other arguments");
+}
+
+inline void check_sizes(const char* op, const char* name, const Tensor& tensor, const std::vector<int64_t>& sizes) {
+  for (size_t dim = 0; dim < sizes.size(); ++dim) {
+    PRED_CHECK(tensor.size(int64_t(dim)) == sizes[dim], op, ": size ", dim, " of ", name, " must be ", sizes[dim],
+               ", got shape ", shape_text(tensor));
+  }
 }
 
 // Calls `body` with T = float or double.

@@ -1,0 +1,196 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Explicit vectors for what the compiler does not vectorise by itself: scans, sums in a fixed order and
+// small matrix products. CPU kernels only; the width is that of the level being compiled.
+#pragma once
+
+#include <stdint.h>
+
+#include <utility>
+
+#include "common/intrinsics.h"
+
+namespace pred::PRED_ISA {
+namespace {
+
+#if defined(__AVX512F__)
+constexpr int kVectorBytes = 64;
+#elif defined(__AVX2__)
+constexpr int kVectorBytes = 32;
+#else
+constexpr int kVectorBytes = 16;
+#endif
+
+template <typename T>
+constexpr int kWidth = kVectorBytes / int(sizeof(T));
+
+template <typename T, int N>
+struct VecOf {
+  typedef T type __attribute__((vector_size(N * sizeof(T))));
+};
+template <typename T>
+struct VecOf<T, 1> {
+  typedef T type;
+};
+template <typename T, int N>
+using Vec = typename VecOf<T, N>::type;
+
+template <int Bytes>
+struct IntOf {
+  using type = int32_t;
+};
+template <>
+struct IntOf<8> {
+  using type = int64_t;
+};
+template <typename T, int N>
+using Mask = Vec<typename IntOf<sizeof(T)>::type, N>;
+
+template <int N, typename T>
+inline __attribute__((always_inline)) Vec<T, N> load(const T* from) {
+  Vec<T, N> v;
+  __builtin_memcpy(&v, from, sizeof v);
+  return v;
+}
+
+template <typename T, typename V>
+inline __attribute__((always_inline)) void store(T* to, V v) {
+  __builtin_memcpy(to, &v, sizeof v);
+}
+
+template <int N, typename T>
+inline __attribute__((always_inline)) Vec<T, N> splat(T x) {
+  return x - Vec<T, N>{};
+}
+
+template <typename T, int N, int... I>
+inline __attribute__((always_inline)) Vec<T, N> shuffle(Vec<T, N> a, Vec<T, N> b) {
+#ifdef __clang__
+  return __builtin_shufflevector(a, b, I...);
+#else
+  return __builtin_shuffle(a, b, Mask<T, N>{I...});
+#endif
+}
+
+template <int K, typename T, int N, int... I>
+inline __attribute__((always_inline)) Vec<T, N> shift_up(Vec<T, N> v, Vec<T, N> fill,
+                                                         std::integer_sequence<int, I...>) {
+  return shuffle<T, N, (I < K ? N + I : I - K)...>(v, fill);
+}
+
+// Lane i gets lane i - K of v; the first K lanes are fill's.
+template <int K, typename T, int N>
+inline __attribute__((always_inline)) Vec<T, N> shift_up(Vec<T, N> v, Vec<T, N> fill) {
+  return shift_up<K, T, N>(v, fill, std::make_integer_sequence<int, N>());
+}
+
+template <int K, typename T, int N, int... I>
+inline __attribute__((always_inline)) Vec<T, N> shift_down(Vec<T, N> v, Vec<T, N> fill,
+                                                           std::integer_sequence<int, I...>) {
+  return shuffle<T, N, (I + K < N ? I + K : N + I)...>(v, fill);
+}
+
+// Lane i gets lane i + K of v; the last K lanes are fill's.
+template <int K, typename T, int N>
+inline __attribute__((always_inline)) Vec<T, N> shift_down(Vec<T, N> v, Vec<T, N> fill) {
+  return shift_down<K, T, N>(v, fill, std::make_integer_sequence<int, N>());
+}
+
+template <int Lane, typename T, int N, int... I>
+inline __attribute__((always_inline)) Vec<T, N> broadcast(Vec<T, N> v, std::integer_sequence<int, I...>) {
+  return shuffle<T, N, (I * 0 + Lane)...>(v, v);
+}
+
+// Every lane gets lane `Lane` of v.
+template <int Lane, typename T, int N>
+inline __attribute__((always_inline)) Vec<T, N> broadcast(Vec<T, N> v) {
+  return broadcast<Lane, T, N>(v, std::make_integer_sequence<int, N>());
+}
+
+// Inclusive scans within a vector.
+template <typename T, int N, int K = 1>
+inline __attribute__((always_inline)) Vec<T, N> prefix_product(Vec<T, N> v) {
+  if constexpr (K < N) return prefix_product<T, N, 2 * K>(v * shift_up<K, T, N>(v, splat<N>(T(1))));
+  else return v;
+}
+
+template <typename T, int N, int K = 1>
+inline __attribute__((always_inline)) Vec<T, N> prefix_sum(Vec<T, N> v) {
+  if constexpr (K < N) return prefix_sum<T, N, 2 * K>(v + shift_up<K, T, N>(v, Vec<T, N>{}));
+  else return v;
+}
+
+template <typename T, int N, int K = 1>
+inline __attribute__((always_inline)) Vec<T, N> suffix_sum(Vec<T, N> v) {
+  if constexpr (K < N) return suffix_sum<T, N, 2 * K>(v + shift_down<K, T, N>(v, Vec<T, N>{}));
+  else return v;
+}
+
+// float -> double, lower and upper half, and back.
+template <int N>
+struct Halves {
+  Vec<double, N / 2> low, high;
+};
+
+#if defined(__AVX512F__)
+inline __attribute__((always_inline)) Halves<16> widen(Vec<float, 16> v) {
+  return {_mm512_cvtps_pd(_mm512_castps512_ps256(v)), _mm512_cvtps_pd(_mm512_extractf32x8_ps(v, 1))};
+}
+inline __attribute__((always_inline)) Vec<float, 16> narrow(Halves<16> v) {
+  return _mm512_insertf32x8(_mm512_castps256_ps512(_mm512_cvtpd_ps(v.low)), _mm512_cvtpd_ps(v.high), 1);
+}
+#elif defined(__AVX2__)
+inline __attribute__((always_inline)) Halves<8> widen(Vec<float, 8> v) {
+  return {_mm256_cvtps_pd(_mm256_castps256_ps128(v)), _mm256_cvtps_pd(_mm256_extractf128_ps(v, 1))};
+}
+inline __attribute__((always_inline)) Vec<float, 8> narrow(Halves<8> v) {
+  return _mm256_set_m128(_mm256_cvtpd_ps(v.high), _mm256_cvtpd_ps(v.low));
+}
+#elif defined(__SSE2__)
+inline __attribute__((always_inline)) Halves<4> widen(Vec<float, 4> v) {
+  return {_mm_cvtps_pd(v), _mm_cvtps_pd(_mm_movehl_ps(v, v))};
+}
+inline __attribute__((always_inline)) Vec<float, 4> narrow(Halves<4> v) {
+  return _mm_movelh_ps(_mm_cvtpd_ps(v.low), _mm_cvtpd_ps(v.high));
+}
+#else
+inline Halves<4> widen(Vec<float, 4> v) {
+  return {Vec<double, 2>{v[0], v[1]}, Vec<double, 2>{v[2], v[3]}};
+}
+inline Vec<float, 4> narrow(Halves<4> v) {
+  return Vec<float, 4>{float(v.low[0]), float(v.low[1]), float(v.high[0]), float(v.high[1])};
+}
+#endif
+
+// Pairwise sum of all lanes.
+template <typename T, int N>
+inline __attribute__((always_inline)) T sum(Vec<T, N> v) {
+  T lane[N];
+  store(lane, v);
+  for (int half = N / 2; half > 0; half /= 2) {
+    for (int i = 0; i < half; ++i) lane[i] += lane[i + half];
+  }
+  return lane[0];
+}
+
+template <int H, typename T, int N, int... I>
+inline __attribute__((always_inline)) Vec<T, N> fold(Vec<T, N> a, Vec<T, N> b, std::integer_sequence<int, I...>) {
+  return shuffle<T, N, ((I & H) ? N + I - H : I)...>(a, b) + shuffle<T, N, ((I & H) ? N + I : I + H)...>(a, b);
+}
+
+// rows[0..N) -> the vector of their N sums, by log2(N) rounds of pairwise folding. Overwrites rows.
+template <typename T, int N, int H = 1>
+inline __attribute__((always_inline)) Vec<T, N> row_sums(Vec<T, N>* rows) {
+  if constexpr (H < N) {
+    for (int i = 0; i < N / (2 * H); ++i) {
+      rows[i] = fold<H, T, N>(rows[2 * i], rows[2 * i + 1], std::make_integer_sequence<int, N>());
+    }
+    return row_sums<T, N, 2 * H>(rows);
+  } else {
+    return rows[0];
+  }
+}
+
+}  // namespace
+}  // namespace pred::PRED_ISA

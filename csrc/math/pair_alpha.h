@@ -1,0 +1,53 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Opacity of the section between two neighbouring samples of a ray (PRED, Eq. 5), with Phi = sigmoid and s >= 0:
+//   alpha = max(1 - Phi(s d_next) / Phi(s d), 0) = Phi(-s d_next) (1 - decay),  decay = exp(-s max(d - d_next, 0))
+//   1 - alpha                                    = Phi(s d_next) + Phi(-s d_next) decay
+// No subtraction of near-equal numbers, no division: exact towards both ends, 0 and 1.
+// V is T or a vector of T.
+#pragma once
+
+#include "math/exp.h"
+
+namespace pred {
+
+template <typename V>
+struct Phi {
+  V free;      // Phi(s d): near 1 in front of the surface
+  V occupied;  // Phi(-s d)
+};
+
+template <typename V, typename T>
+PRED_HOST_DEVICE Phi<V> phi(T inv_s, V sdf) {
+  const V sharpness = inv_s - V{}, distance = negative_magnitude(sdf);
+  const V x = sharpness * distance;
+  // Where |x| is 80, half a unit in its last place is worth 4e-6 of the result: carry the rounding error along.
+  const V e = exp_nonpositive(x, product_error(sharpness, distance, x)).exp;
+  const V large = T(1) / (T(1) + e);
+  const V small = e * large;
+  return {sdf < V{} ? small : large, sdf < V{} ? large : small};
+}
+
+template <typename V>
+struct PairAlpha {
+  V alpha;
+  V passed;  // 1 - alpha
+  V decay;
+  V lost;  // 1 - decay
+};
+
+template <typename V, typename T>
+PRED_HOST_DEVICE PairAlpha<V> pair_alpha(T inv_s, V sdf, V next_sdf, Phi<V> next) {
+  const V rise = next_sdf - sdf;
+  const Exp<V> e = exp_nonpositive(inv_s * (rise >= V{} ? V{} : rise), -V{});  // NaN stays NaN
+  return {next.occupied * -e.expm1, next.free + next.occupied * e.exp, e.exp, -e.expm1};
+}
+
+// The sharpness as the formulas take it: below 0, where they mean nothing, everything becomes NaN.
+template <typename T>
+PRED_HOST_DEVICE T valid_sharpness(T inv_s) {
+  return inv_s >= T(0) ? inv_s : T(__builtin_nan(""));
+}
+
+}  // namespace pred

@@ -1,0 +1,212 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// One iteration owns one ray and writes that ray's row only.
+//
+// A section's samples are written as whole vectors, of which the surplus lanes are overwritten by the sections that
+// follow; the row is assembled in scratch, so that no surplus leaves it. Rays whose t or u are out of order or not
+// finite take the slow path: search, then sort.
+#include "ops/resample_rays.h"
+
+#include "math/lanes.h"
+
+namespace pred::PRED_ISA {
+namespace {
+
+constexpr int64_t kPad = 16;  // at least a vector, on both sides of every row
+
+template <typename T>
+struct Limits;
+template <>
+struct Limits<float> {
+  static constexpr float smallest = __FLT_MIN__, largest = __FLT_MAX__, below_one = 1.0f - __FLT_EPSILON__ / 2;
+};
+template <>
+struct Limits<double> {
+  static constexpr double smallest = __DBL_MIN__, largest = __DBL_MAX__, below_one = 1.0 - __DBL_EPSILON__ / 2;
+};
+
+template <typename T>
+struct Row {
+  T *mass, *cdf, *inverse, *u, *merged;
+};
+
+template <typename T>
+static int64_t scratch_size(const ResampleRaysArgs<T>& a) {
+  return 4 * (a.num_samples + 2 * kPad) + 2 * (a.num_new + 2 * kPad) + kPad;
+}
+
+template <typename T>
+static Row<T> make_row(const ResampleRaysArgs<T>& a, T* scratch) {
+  const int64_t stride = a.num_samples + 2 * kPad;
+  T* first = scratch + kPad;
+  return {first, first + stride, first + 2 * stride, first + 3 * stride, first + 3 * stride + a.num_new + 2 * kPad};
+}
+
+template <typename T>
+static inline bool ascending(const T* x, int64_t n) {
+  int32_t out_of_order = 0;
+  for (int64_t i = 0; i + 1 < n; ++i) out_of_order |= x[i] <= x[i + 1] ? 0 : 1;
+  return out_of_order == 0;  // false for NaN
+}
+
+// cumulative[i] = sum of mass[0..i), for i in [0, n]; summed in double.
+template <typename T>
+static inline void accumulate(const T* mass, int64_t n, T* cumulative) {
+  constexpr int W = kWidth<double>;
+  using Wide = Vec<double, W>;
+  Wide carry{};
+  cumulative[0] = T(0);
+  for (int64_t i = 0; i < n; i += W) {
+    const Wide sums = carry + prefix_sum<double, W>(__builtin_convertvector(load<W>(mass + i), Wide));
+    using Out = Vec<T, W>;
+    store(cumulative + i + 1, __builtin_convertvector(sums, Out));
+    carry = broadcast<W - 1, double, W>(sums);
+  }
+}
+
+// The cumulative distribution over sections, from 0 to exactly 1. False where there is none: a range is not finite.
+template <typename T>
+static inline bool distribution(const T* __restrict t, const T* __restrict weights, int64_t num_samples,
+                                const Row<T>& row) {
+  const int64_t sections = num_samples - 1;
+  T* __restrict mass = row.mass;
+  T* __restrict cdf = row.cdf;
+  for (int64_t i = 0; i < sections; ++i) mass[i] = weights[i] <= T(0) ? T(0) : weights[i];
+  for (int64_t i = sections; i < sections + kPad; ++i) mass[i] = T(0);
+  accumulate(mass, sections, cdf);
+  T total = cdf[sections];
+  if (!(total >= Limits<T>::smallest && total <= Limits<T>::largest)) {
+    for (int64_t i = 0; i < sections; ++i) mass[i] = t[i + 1] - t[i] <= T(0) ? T(0) : t[i + 1] - t[i];
+    accumulate(mass, sections, cdf);
+    total = cdf[sections];
+    if (!(total <= Limits<T>::largest)) return false;
+    if (total == T(0)) {  // all t are equal: any section will do
+      cdf[sections] = T(1);
+      return true;
+    }
+  }
+  for (int64_t i = 0; i <= sections; ++i) cdf[i] = cdf[i] / total;
+  return true;
+}
+
+// Clips u to [0, 1); keeps NaN.
+template <typename T>
+static inline void copy_positions(const T* __restrict from, int64_t n, T* __restrict to) {
+  for (int64_t i = 0; i < n; ++i) {
+    const T low = from[i] < T(0) ? T(0) : from[i];
+    to[i] = low > Limits<T>::below_one ? Limits<T>::below_one : low;
+  }
+  to[-1] = -__builtin_inf();  // ends the searches
+  to[n] = __builtin_inf();
+}
+
+template <typename T>
+static inline void merge(const T* t, int64_t num_samples, int64_t num_new, const Row<T>& row) {
+  constexpr int W = kWidth<T> < 8 ? kWidth<T> : 8;
+  const int64_t sections = num_samples - 1;
+  const T *u = row.u, *cdf = row.cdf;
+  T* __restrict inverse = row.inverse;
+  for (int64_t i = 0; i < sections; ++i) {
+    const T width = cdf[i + 1] - cdf[i];
+    inverse[i] = width >= Limits<T>::smallest ? T(1) / width : T(0);
+  }
+  const T scale = T(num_new);
+  int64_t begin = 0;  // c_i
+  for (int64_t i = 0; i < sections; ++i) {
+    // c_{i+1}, guessed as for evenly spaced u.
+    const T bound = cdf[i + 1];
+    int64_t end = int64_t(bound * scale);
+    if (end > num_new) end = num_new;  // scale may be rounded up
+    end += u[end] < bound;
+    while (u[end] < bound) ++end;
+    while (u[end - 1] >= bound) --end;
+    // Lane 0 of the first vector is u[begin - 1] < cdf_i, which becomes t_i itself.
+    T* out = row.merged + i + 1;
+    for (int64_t k = begin - 1; k < end; k += W) {
+      auto offset = load<W>(u + k) - cdf[i];
+      offset = offset > T(0) ? offset : Vec<T, W>{};
+      auto x = t[i] + offset * inverse[i] * (t[i + 1] - t[i]);
+      x = x < t[i + 1] ? x : splat<W>(t[i + 1]);
+      store(out + k, x);
+    }
+    begin = end;
+  }
+  row.merged[sections + num_new] = t[sections];
+}
+
+template <typename T>
+static inline bool sorts_after(T a, T b) {
+  return a > b || (a != a && b == b);  // NaN last
+}
+
+// Heap sort: in place, and fast for any order.
+template <typename T>
+static void sort(T* x, int64_t n) {
+  for (int64_t top = n / 2 - 1, last = n; last > 1;) {
+    if (top < 0) {  // the heap stands: move its largest to the end
+      --last;
+      const T largest = x[0];
+      x[0] = x[last];
+      x[last] = largest;
+    }
+    int64_t at = top < 0 ? 0 : top;
+    for (int64_t child; (child = 2 * at + 1) < last; at = child) {
+      if (child + 1 < last && sorts_after(x[child + 1], x[child])) ++child;
+      if (!sorts_after(x[child], x[at])) break;
+      const T swap = x[at];
+      x[at] = x[child];
+      x[child] = swap;
+    }
+    if (top >= 0) --top;
+  }
+}
+
+template <typename T>
+static void merge_any(const T* t, int64_t num_samples, int64_t num_new, bool has_cdf, const Row<T>& row) {
+  const T* cdf = row.cdf;
+  for (int64_t i = 0; i < num_samples; ++i) row.merged[i] = t[i];
+  for (int64_t k = 0; k < num_new; ++k) {
+    const T u = row.u[k];
+    int64_t low = 0, high = num_samples - 1;  // the section is in [low, high)
+    while (high - low > 1) {
+      const int64_t middle = low + (high - low) / 2;
+      (cdf[middle] <= u ? low : high) = middle;
+    }
+    const T width = cdf[low + 1] - cdf[low];
+    const T fraction = (u - cdf[low]) / (width > T(0) ? width : T(1));
+    row.merged[num_samples + k] = has_cdf ? t[low] + fraction * (t[low + 1] - t[low]) : T(__builtin_nan(""));
+  }
+  sort(row.merged, num_samples + num_new);
+}
+
+template <typename T>
+static void resample(const ResampleRaysArgs<T>& a, T* merged, T* scratch, int64_t begin, int64_t end) {
+  const Row<T> row = make_row(a, scratch);
+  const int64_t last = a.num_samples - 1, out_size = a.num_samples + a.num_new;
+  bool u_ascends = false;
+  for (int64_t ray = begin; ray < end; ++ray) {
+    if (a.u_stride != 0 || ray == begin) {
+      copy_positions(a.u + ray * a.u_stride, a.num_new, row.u);
+      u_ascends = ascending(row.u, a.num_new + 1);  // with its end, so that a single NaN is noticed
+    }
+    const T* t = a.t + ray * a.num_samples;
+    const bool has_cdf = distribution(t, a.weights + ray * a.weight_stride, a.num_samples, row);
+    const bool t_ascends = ascending(t, a.num_samples) && t[0] >= -Limits<T>::largest && t[last] <= Limits<T>::largest;
+    if (has_cdf && u_ascends && t_ascends) {
+      merge(t, a.num_samples, a.num_new, row);
+    } else {
+      merge_any(t, a.num_samples, a.num_new, has_cdf, row);
+    }
+    T* __restrict out = merged + ray * out_size;
+    const T* __restrict from = row.merged;
+    for (int64_t i = 0; i < out_size; ++i) out[i] = from[i];
+  }
+}
+
+}  // namespace
+
+const ResampleRaysKernels<float> resample_rays_f32 = {scratch_size<float>, resample<float>};
+const ResampleRaysKernels<double> resample_rays_f64 = {scratch_size<double>, resample<double>};
+
+}  // namespace pred::PRED_ISA

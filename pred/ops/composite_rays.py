@@ -1,0 +1,205 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""Volume rendering along rays: weights, depth, opacity and any channels in one pass."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from pred import _native
+from pred.ops._check import check_choice, check_like, check_shape
+from pred.ops.sdf_to_alpha import sdf_arguments, sdf_to_alpha_reference, widen
+
+
+class Composite(NamedTuple):
+    """What :func:`composite_rays` returns."""
+
+    weights: Tensor  # [R, S]
+    depth: Tensor  # [R]
+    opacity: Tensor  # [R]
+    values: Tensor | None  # [R, C]
+
+
+def composite_rays(
+    sdf: Tensor,  # [R, S]
+    inv_s: Tensor | float,
+    t: Tensor,  # [R, S]
+    values: Tensor | None = None,  # [R, S, C]
+    *,
+    depth_at: str = "start",
+    normalize_depth: bool = False,
+    last: str = "zero",
+    detach_sdf: bool = False,
+    detach_inv_s: bool = True,
+    normalize_eps: float = 1e-10,
+) -> Composite:
+    """Renders depth and channels from signed distances along rays (PRED, Eq. 5).
+
+    ``w_i = alpha_i prod_{j<i} (1 - alpha_j)`` with the opacities of :func:`pred.ops.sdf_to_alpha`;
+    ``depth = sum_i w_i t_i``, ``opacity = sum_i w_i``, ``values = sum_i w_i values_i``. Weight i belongs to the section
+    from ``t_i`` to ``t_{i+1}``.
+
+    Args:
+        sdf: ``[R, S]`` or ``[R, S, 1]`` signed distances in metres, float32 or float64.
+        inv_s: sharpness per metre, above 0: a number, or a tensor of one element. Only a number is checked.
+        t: ``[R, S]`` or ``[R, S, 1]`` range of each sample in metres, same dtype.
+        values: ``[R, S, C]`` anything to be rendered, such as class probabilities, same dtype.
+        depth_at: where a section's depth is read: its ``"start"`` ``t_i``, or its middle (``"mid"``); the last sample,
+            which has no end, counts at its own ``t``.
+        normalize_depth: divide the depth by ``opacity + normalize_eps``. By default a ray that is partly
+            transparent is nearer than its surface, as in the paper.
+        last: opacity of the last sample, ``"zero"`` or ``"opaque"`` (1, so that the weights sum to 1).
+        detach_sdf: treat ``sdf`` as a constant, as the semantic loss does; skips that part of the backward pass.
+        detach_inv_s: with ``detach_sdf``, treat ``inv_s`` as a constant too.
+        normalize_eps: see ``normalize_depth``; a ray of opacity 0 has depth 0.
+
+    Returns:
+        :class:`Composite`; the weights always, ``values`` only where given. A ray that meets no surface has weights 0.
+        A NaN stays in its ray (and in the gradient of ``inv_s``, which all rays share).
+
+    Raises:
+        ValueError: shape, device or an unknown choice. TypeError: dtype.
+
+    Differentiable once in ``sdf``, ``inv_s``, ``t`` and ``values``, through all outputs; exact for opacities 0 and 1.
+    Deterministic for any thread count.
+    """
+    op = "composite_rays"
+    check_choice(op, "depth_at", depth_at, ("start", "mid"))
+    check_choice(op, "last", last, ("zero", "opaque"))
+    sdf, inv_s, t, values = _arguments(sdf, inv_s, t, values)
+    if detach_sdf:
+        sdf = sdf.detach()
+        inv_s = inv_s.detach() if detach_inv_s else inv_s
+    if _native.use_native(op, sdf) and hasattr(torch.ops.pred, "composite_rays"):
+        weights, depth, opacity, rendered = torch.ops.pred.composite_rays(
+            sdf, inv_s, t, values, depth_at == "mid", last == "opaque"
+        )
+        out = Composite(weights, depth, opacity, None if values is None else rendered)
+    else:
+        out = composite_rays_reference(sdf, inv_s, t, values, depth_at=depth_at, last=last)
+    return out._replace(depth=out.depth / (out.opacity + normalize_eps)) if normalize_depth else out
+
+
+def composite_rays_reference(
+    sdf: Tensor,  # [R, S]
+    inv_s: Tensor | float,
+    t: Tensor,  # [R, S]
+    values: Tensor | None = None,  # [R, S, C]
+    *,
+    depth_at: str = "start",
+    normalize_depth: bool = False,
+    last: str = "zero",
+    detach_sdf: bool = False,
+    detach_inv_s: bool = True,
+    normalize_eps: float = 1e-10,
+) -> Composite:
+    """Plain PyTorch form of :func:`composite_rays`, with optical depths ``tau = -log(1 - alpha)``."""
+    sdf, inv_s, t, values = _arguments(sdf, inv_s, t, values)
+    if detach_sdf:
+        sdf = sdf.detach()
+        inv_s = inv_s.detach() if detach_inv_s else inv_s
+    alpha = sdf_to_alpha_reference(sdf, inv_s, last=last)
+    # 1 - alpha_i = Phi(d_{i+1}) / Phi(d_i). The difference of logarithms is inexact for small alpha, log1p for large;
+    # where() twice keeps the other branch's derivative finite.
+    log_phi = torch.nn.functional.logsigmoid(inv_s * sdf)
+    section = alpha[:, :-1]
+    thin = section <= 0.5
+    thin_tau = -torch.log1p(-torch.where(thin, section, torch.zeros_like(section)))
+    tau = torch.where(thin, thin_tau, log_phi[:, :-1] - log_phi[:, 1:])
+    transmittance = torch.exp(-torch.cat([torch.zeros_like(sdf[:, :1]), tau.cumsum(dim=1)], dim=1))
+    weights = transmittance * alpha
+    position = t
+    if depth_at == "mid":
+        position = torch.cat([(t[:, :-1] + t[:, 1:]) / 2, t[:, -1:]], dim=1)
+    depth = (weights * position).sum(dim=1)
+    opacity = weights.sum(dim=1)
+    if normalize_depth:
+        depth = depth / (opacity + normalize_eps)
+    rendered = None if values is None else torch.einsum("rs,rsc->rc", weights, values)
+    return Composite(weights, depth, opacity, rendered)
+
+
+def _arguments(
+    sdf: Tensor, inv_s: Tensor | float, t: Tensor, values: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    op = "composite_rays"
+    sdf, inv_s = sdf_arguments(op, sdf, inv_s)
+    t = widen(t[..., 0] if t.dim() == 3 and t.shape[2] == 1 else t)
+    where = f" as sdf, with R={sdf.shape[0]} and S={sdf.shape[1]}"
+    check_shape(op, "t", t, sdf.shape, where)
+    check_like(op, "t", t, "sdf", sdf)
+    if values is not None:
+        values = widen(values)
+        check_shape(op, "values", values, (*sdf.shape, "C"))
+        check_like(op, "values", values, "sdf", sdf)
+    return sdf, inv_s, t, values
+
+
+def _fake(
+    sdf: Tensor, inv_s: Tensor, t: Tensor, values: Tensor | None, depth_mid: bool, last_opaque: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    rays = sdf.shape[0]
+    rendered = sdf.new_empty(0) if values is None else sdf.new_empty(rays, values.shape[2])
+    return sdf.new_empty(sdf.shape), sdf.new_empty(rays), sdf.new_empty(rays), rendered
+
+
+def _save(ctx: Any, inputs: Any, output: Any) -> None:
+    sdf, inv_s, t, values, ctx.depth_mid, ctx.last_opaque = inputs
+    ctx.set_materialize_grads(False)
+    if ctx.needs_input_grad[0] or ctx.needs_input_grad[1]:
+        ctx.save_for_backward(sdf, inv_s, t, values, None)  # the weights are computed again
+    else:
+        ctx.save_for_backward(sdf, inv_s, t, None, output[0])
+
+
+def _backward(
+    ctx: Any,
+    grad_weights: Tensor | None,
+    grad_depth: Tensor | None,
+    grad_opacity: Tensor | None,
+    grad_values: Tensor | None,
+) -> tuple[Tensor | None, ...]:
+    sdf, inv_s, t, values, weights = ctx.saved_tensors
+    need_sdf, need_inv_s, need_t, need_values = ctx.needs_input_grad[:4]
+    grads = (grad_weights, grad_depth, grad_opacity, grad_values)
+    if all(grad is None for grad in grads):
+        return (None,) * 6
+    needs = (need_sdf, need_inv_s, need_t and grad_depth is not None, need_values and grad_values is not None)
+    out = torch.ops.pred.composite_rays_backward(
+        *grads, sdf, inv_s, t, values, weights, ctx.depth_mid, ctx.last_opaque, *needs
+    )
+    return *(grad if need else None for grad, need in zip(out, needs, strict=True)), None, None
+
+
+def _fake_backward(
+    grad_weights: Tensor | None,
+    grad_depth: Tensor | None,
+    grad_opacity: Tensor | None,
+    grad_values: Tensor | None,
+    sdf: Tensor,
+    inv_s: Tensor,
+    t: Tensor,
+    values: Tensor | None,
+    weights: Tensor | None,
+    depth_mid: bool,
+    last_opaque: bool,
+    need_sdf: bool,
+    need_inv_s: bool,
+    need_t: bool,
+    need_values: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    channels = 0 if grad_values is None else grad_values.shape[1]
+    return (
+        sdf.new_empty(sdf.shape if need_sdf else 0),
+        sdf.new_empty(() if need_inv_s else 0),
+        sdf.new_empty(sdf.shape if need_t else 0),
+        sdf.new_empty((*sdf.shape, channels) if need_values else 0),
+    )
+
+
+if _native.available() and hasattr(torch.ops.pred, "composite_rays"):
+    _native.register("composite_rays", fake=_fake, setup_context=_save, backward=_backward)
+    _native.register("composite_rays_backward", fake=_fake_backward)
