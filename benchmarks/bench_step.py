@@ -1,0 +1,284 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""The rendering step: from a BEV map to the gradients of the loss, without the encoder.
+
+Per step: 512 depth rays (with the Eikonal term) and 512 semantic rays, each with a coarse pass, resampling to 96 + 128
+samples, decoding, compositing and losses; then the backward pass to the map and to every parameter. Contenders:
+
+``ours``       `pred.models` on the compiled kernels
+``reference``  the same model on the PyTorch references of `pred.ops`
+``eager``      plain PyTorch as one would write it first: `F.grid_sample`, and the SDF's gradient by
+               `autograd.grad(create_graph=True)`
+``compiled``   `torch.compile` of ``reference``, forward and backward pass in one graph
+
+Useful arithmetic, in multiply-adds (P encoding width, h hidden, L Linear layers, C map channels, K classes): the
+trunk takes m = P h + (L - 2) h^2 per sample, the output row(s) h each; the first layer's share of the map takes
+C h per cell. A backward pass takes twice its forward pass, and the SDF's gradient is one more pass through the trunk.
+Coarse samples: m + h. Depth samples: 3 (m + h) + 3 (m + h). Semantic samples: 3 (m + (1 + K) h). Map: 3 C h per cell.
+Softplus, gathers and compositing are not counted, nor is anything computed twice.
+
+``python -m benchmarks.bench_step CONTENDER SIZES THREADS`` prints the memory that one step adds, in bytes: a process of
+its own, because the peak of resident memory is a process's.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from benchmarks import cases
+from benchmarks.bench_ops import KINDS, compiled, first_line, missing_kernel
+from benchmarks.cases import SIZES, Sizes
+from benchmarks.measure import current_allocator, enter_allocator, time_interleaved
+from benchmarks.report import Row, Target
+from pred.losses import LossConfig, depth_loss, eikonal_loss, semantic_loss
+from pred.models.field import FieldConfig, FieldDecoder, FieldOutput
+from pred.models.renderer import Renderer, RendererConfig, Sharpness
+
+LOSS_TOLERANCE = 1e-4
+GRADIENT_TOLERANCE = 1e-3
+ROUNDS = 3
+
+Run = Callable[[], list[Tensor]]
+
+
+class PlainField(FieldDecoder):
+    """`FieldDecoder` without its rewritings: gather, concatenate, MLP, double backward."""
+
+    def project(self, bev: Tensor) -> Tensor:
+        """The map itself."""
+        return bev
+
+    def decode(
+        self, projected: Tensor, points_m: Tensor, with_gradient: bool = False, semantics: bool = True
+    ) -> FieldOutput:
+        """As `FieldDecoder.decode`, from the map."""
+        points_m = points_m.detach().requires_grad_(with_gradient)
+        position = (points_m - self.range_centre_m) / self.range_half_extent_m
+        features = F.grid_sample(projected, position[:, None, :, :2], align_corners=False)[:, :, 0].transpose(1, 2)
+        angles = (position[..., None, :] * self.frequencies[:, None]).flatten(-2)
+        activation = torch.cat([features, position, angles.sin(), angles.cos()], dim=-1)
+        *hidden_layers, output_layer = self.layers
+        assert isinstance(output_layer, torch.nn.Linear)
+        for layer in hidden_layers:
+            activation = F.softplus(layer(activation), self.config.softplus_beta)
+        rows = slice(None) if semantics else slice(1)
+        output = F.linear(activation, output_layer.weight[rows], output_layer.bias[rows])
+        sdf = output[..., 0] * self.config.sdf_scale_m
+        gradient = None
+        if with_gradient:
+            (gradient,) = torch.autograd.grad(sdf.sum(), points_m, create_graph=True)
+        return FieldOutput(sdf, output[..., 1:] if semantics else None, gradient)
+
+
+class Rays:
+    """Rays from one origin to measured points."""
+
+    def __init__(self, points_m: Tensor, origin_m: tuple[float, float, float], seed: int) -> None:
+        offset = points_m - torch.tensor(origin_m)
+        self.depth_m = offset.norm(dim=-1)[None]  # [1, R]
+        self.directions = offset[None] / self.depth_m[..., None]  # [1, R, 3]
+        self.origins = torch.tensor(origin_m).expand_as(self.directions)
+        self.valid = torch.ones_like(self.depth_m, dtype=torch.bool)
+        self.jitter = torch.rand(self.depth_m.shape, generator=torch.Generator().manual_seed(seed))
+
+
+class Step:
+    """One rendering step: map, rays, and the models."""
+
+    def __init__(self, sizes: Sizes, field_type: type[FieldDecoder]) -> None:
+        torch.manual_seed(0)
+        config = FieldConfig(hidden=sizes.step_hidden, num_classes=sizes.classes)
+        self.field = field_type(sizes.bev_channels, config, cases.POINT_RANGE_M)
+        self.renderer = Renderer(
+            RendererConfig(coarse_samples=sizes.coarse_samples, fine_samples=sizes.fine_samples), cases.POINT_RANGE_M
+        )
+        self.sharpness = Sharpness(self.renderer.config.initial_inv_s)
+        self.bev = cases.bev_map(sizes.bev_channels, sizes.bev_cells).requires_grad_()
+        count = sizes.step_rays
+        points = cases.lidar_points(max(2 * count, sizes.points // 10))[:, :3]
+        points = points[torch.randperm(len(points))[: 2 * count]]
+        self.depth = Rays(points[:count], (0.0, 0.0, 0.0), seed=1)
+        self.semantic = Rays(points[count:], (0.0, 1.5, -0.3), seed=2)
+        self.target = F.one_hot(torch.randint(sizes.classes, (1, count)), sizes.classes).float()
+        self.confidence = torch.ones(1, count)
+        self.leaves = [self.bev, *self.field.parameters(), *self.sharpness.parameters()]
+
+    def loss(self) -> Tensor:
+        """Forward pass."""
+        weights = LossConfig()
+        projected, inv_s = self.field.project(self.bev), self.sharpness()
+        rays = self.depth
+        samples = self.renderer.sample(
+            self.field, projected, inv_s, rays.origins, rays.directions, rays.valid, rays.jitter
+        )
+        rendered = self.renderer.render(self.field, projected, inv_s, samples, with_gradient=True)
+        assert rendered.gradient is not None
+        depth = depth_loss(rendered.depth_m, rays.depth_m, rendered.hit, weights.depth_unit_m)
+        eikonal = eikonal_loss(rendered.gradient, rendered.hit)
+
+        rays = self.semantic
+        samples = self.renderer.sample(
+            self.field, projected, inv_s, rays.origins, rays.directions, rays.valid, rays.jitter
+        )
+        rendered = self.renderer.render(self.field, projected, inv_s, samples, semantics=True, detach_sdf=True)
+        assert rendered.semantics is not None
+        semantic = semantic_loss(rendered.semantics, self.target, self.confidence, rendered.hit)
+        return weights.semantic_weight * semantic + weights.depth_weight * depth + weights.eikonal_weight * eikonal
+
+
+def contender(name: str, sizes: Sizes) -> Run:
+    """One step of a contender; it returns the loss, then the gradients of the map and of every parameter."""
+    step = Step(sizes, PlainField if name == "eager" else FieldDecoder)
+    backend = "native" if name == "ours" else "reference"
+
+    def loss_and_gradients() -> list[Tensor]:
+        loss = step.loss()
+        return [loss.detach(), *torch.autograd.grad(loss, step.leaves)]
+
+    call: Run = compiled(loss_and_gradients) if name == "compiled" else loss_and_gradients
+
+    def run() -> list[Tensor]:
+        os.environ["PRED_BACKEND"] = backend  # read at each call
+        return call()
+
+    return run
+
+
+def useful_flop(sizes: Sizes) -> int:
+    """See the head of this module."""
+    config = FieldConfig(hidden=sizes.step_hidden, num_classes=sizes.classes)
+    hidden = config.hidden
+    trunk = (3 + 6 * config.frequencies) * hidden + (config.layers - 2) * hidden**2
+    samples = sizes.coarse_samples + sizes.fine_samples
+    per_ray_pair = (
+        2 * sizes.coarse_samples * (trunk + hidden)
+        + samples * 6 * (trunk + hidden)
+        + samples * 3 * (trunk + (1 + config.num_classes) * hidden)
+    )
+    return 2 * (sizes.step_rays * per_ray_pair + 3 * sizes.bev_cells**2 * sizes.bev_channels * hidden)
+
+
+def run_step(
+    sizes_name: str, threads: int, kinds: Sequence[str], min_time_s: float, on_step: Callable[[str], None]
+) -> list[Row]:
+    """Checks the contenders against ``reference``, times them, and measures the memory that each adds.
+
+    Args:
+        sizes_name: key of `cases.SIZES`.
+        threads: torch's threads.
+        kinds: which of `bench_ops.KINDS` take part; ``reference`` always does.
+        min_time_s: see `time_interleaved`; a step of real size takes one call per round.
+        on_step: told what happens next.
+    """
+    sizes = SIZES[sizes_name]
+    torch.set_num_threads(threads)
+    if "compiled" in kinds:
+        torch._dynamo.reset()
+    rows: dict[str, Row] = {}
+    runs: dict[str, Run] = {}
+    expected: list[Tensor] = []
+    for name in ("reference", *(kind for kind in KINDS if kind in kinds)):
+        on_step(f"step, {threads} threads: {name}")
+        row = rows[name] = _row(name, sizes, threads)
+        if name == "ours" and (reason := missing_kernel("composite_rays")):
+            row.status = f"missing: {reason}"
+            continue
+        try:
+            run = contender(name, sizes)
+            result = run()
+        except Exception as error:  # a compiler may refuse in any way; the run goes on
+            row.status = f"refused: {first_line(error)}"
+            continue
+        expected = expected or result
+        row.error, wrong = _compare(result, expected)
+        del result
+        if wrong:
+            row.status = f"wrong: {wrong}"
+        else:
+            runs[name] = run
+    on_step(f"step, {threads} threads: timing")
+    for name, timing in time_interleaved(runs, threads, min_time_s, ROUNDS).items():
+        rows[name].timing = timing
+    for name in runs:
+        if name != "compiled":  # its compiler's memory would count
+            on_step(f"step, {threads} threads: memory of {name}")
+            _add_memory(rows[name], sizes_name)
+    return list(rows.values())
+
+
+def _row(name: str, sizes: Sizes, threads: int) -> Row:
+    rays, samples = sizes.step_rays, (sizes.coarse_samples, sizes.fine_samples)
+    return Row(
+        op="step",
+        case=f"rendering step {rays} + {rays} rays, {samples[0]} + {samples[1]} samples, hidden {sizes.step_hidden}",
+        phase="forward+backward",
+        threads=threads,
+        contender=name,
+        kind=name,
+        unit="rays",
+        items=2 * rays,
+        work="useful FLOP of the matrix products, see benchmarks/bench_step.py",
+        flop=useful_flop(sizes),
+        targets=(Target("eager", 4), Target("eager's memory", 4)) if sizes == cases.REAL else (),
+    )
+
+
+def _compare(actual: list[Tensor], expected: list[Tensor]) -> tuple[float, str]:
+    """Largest relative error of loss and gradients, and what is wrong (nothing: empty)."""
+    loss_error = float((actual[0] - expected[0]).abs() / expected[0].abs())
+    norms = [float(grad.norm()) for grad in expected[1:]]
+    errors = [
+        float((have - want).norm()) / max(norm, 1e-3 * max(norms))
+        for have, want, norm in zip(actual[1:], expected[1:], norms, strict=True)
+    ]
+    wrong = ""
+    if not loss_error <= LOSS_TOLERANCE:
+        wrong = f"the loss differs by {loss_error:.2g}"
+    elif not all(error <= GRADIENT_TOLERANCE for error in errors):
+        wrong = f"a gradient differs by {max(errors):.2g} of its norm"
+    return max(loss_error, *errors), wrong
+
+
+def _add_memory(row: Row, sizes_name: str) -> None:
+    command = [sys.executable, "-m", "benchmarks.bench_step", row.contender, sizes_name, str(row.threads)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+    if done.returncode == 0:
+        row.peak_memory_bytes = int(done.stdout)
+    else:
+        row.status = f"ok; its memory is unknown: the process that measures it ended with {done.returncode}"
+
+
+def added_memory(run: Callable[[], object]) -> int:
+    """Peak resident memory during a call beyond what was resident before, bytes."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew from here
+        before = _status_bytes("VmRSS")
+        run()
+        return _status_bytes("VmHWM") - before
+    except OSError:  # no such file system, or not allowed: the peak of the start-up may hide some of the step's
+        unit = 1 if sys.platform == "darwin" else 1024
+        before = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        run()
+        return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+
+
+def _status_bytes(name: str) -> int:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(name + ":"):
+            return 1024 * int(line.split()[1])
+    raise OSError(f"/proc/self/status holds no {name}")
+
+
+if __name__ == "__main__":
+    enter_allocator(current_allocator() or "raised")
+    torch.set_num_threads(int(sys.argv[3]))
+    print(added_memory(contender(sys.argv[1], SIZES[sys.argv[2]])))

@@ -1,0 +1,258 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""How things are measured: interleaved timing, the machine's ceilings, allocator, and what is written down about it."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.benchmark import Timer
+
+import pred
+from pred._native import native_status
+
+_ALLOCATOR_MARK = "PRED_BENCHMARK_ALLOCATOR"
+_ALLOCATOR_VARIABLES = ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
+_ALLOCATOR_LIMIT_BYTES = 4 << 30
+
+ROUNDS = 5
+COPY_BYTES = 256 << 20
+MATRIX_SIZE = 256
+SLOW_CALL_S = 0.3
+RESULTS = "benchmarks/results"  # files of earlier runs do not make the sources differ from their commit
+
+
+def enter_allocator(allocator: str) -> None:
+    """Makes this process run under an allocator setting, by starting the interpreter anew where it does not yet.
+
+    glibc serves blocks of more than 32 MB from fresh pages, and gives freed memory at the heap's end back to the
+    system. A large output then costs page faults, which say nothing about a kernel. ``raised`` lifts both thresholds
+    out of the way; ``default`` leaves the C library as it is. They are read at process start only.
+    """
+    if current_allocator() == allocator:
+        return
+    os.environ[_ALLOCATOR_MARK] = allocator
+    # torch.compile's idle compile workers would share the cores with what is timed.
+    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
+    for variable in _ALLOCATOR_VARIABLES:
+        if allocator == "raised":
+            os.environ[variable] = str(_ALLOCATOR_LIMIT_BYTES)
+        else:
+            os.environ.pop(variable, None)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+
+
+def current_allocator() -> str | None:
+    """What `enter_allocator` set up for this process or one that started it; None: nothing yet."""
+    return os.environ.get(_ALLOCATOR_MARK)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds per call, over all calls of all rounds."""
+
+    median_s: float
+    q25_s: float
+    q75_s: float
+    samples: int
+    round_medians_s: list[float]
+    """One per round; the contenders' rounds alternate, so that equal positions saw the same disturbances."""
+    page_faults_per_call: float
+
+    def record(self) -> dict[str, Any]:
+        """For the JSON file."""
+        return asdict(self)
+
+
+def time_interleaved(
+    contenders: Mapping[str, Callable[[], object]],
+    threads: int,
+    min_time_s: float,
+    rounds: int = ROUNDS,
+) -> dict[str, Timing]:
+    """Times callables in turn, round after round.
+
+    Args:
+        contenders: what to call, by name; each was called before.
+        threads: torch's threads during the measurement.
+        min_time_s: time spent on each contender, over all rounds. A slow one takes one call per round, and sits out the
+            rounds after the third if it is far beyond its time.
+        rounds: how often each contender has its turn.
+    """
+    blocks: dict[str, list[_Block]] = {name: [] for name in contenders}
+    spent_s = dict.fromkeys(contenders, 0.0)
+    for turn in range(rounds):
+        for name, run in contenders.items():
+            if turn < 3 or spent_s[name] < 3 * min_time_s:
+                start_time = time.perf_counter()
+                blocks[name].append(_time_block(run, threads, min_time_s / rounds))
+                spent_s[name] += time.perf_counter() - start_time
+    return {name: _join(blocks[name]) for name in contenders}
+
+
+@dataclass(frozen=True)
+class _Block:
+    """One contender's turn."""
+
+    call_s: list[float]
+    page_faults_per_call: float
+
+
+def _time_block(run: Callable[[], object], threads: int, min_time_s: float) -> _Block:
+    calls = 0
+
+    def counted() -> None:
+        nonlocal calls
+        calls += 1
+        run()
+
+    faults = _page_faults()
+    torch.set_num_threads(threads)
+    start_time = time.perf_counter()
+    counted()
+    call_s = [time.perf_counter() - start_time]
+    if call_s[0] < SLOW_CALL_S:  # otherwise that was the measurement: warm caches mean little to so long a call
+        timer = Timer("run()", globals={"run": counted}, num_threads=threads)
+        call_s = timer.blocked_autorange(min_run_time=min_time_s).times
+    return _Block(call_s, (_page_faults() - faults) / calls)
+
+
+def _join(blocks: list[_Block]) -> Timing:
+    call_s = [value for block in blocks for value in block.call_s]
+    median_s, q25_s, q75_s = _quartiles(call_s)
+    return Timing(
+        median_s,
+        q25_s,
+        q75_s,
+        len(call_s),
+        [statistics.median(block.call_s) for block in blocks],
+        statistics.median(block.page_faults_per_call for block in blocks),
+    )
+
+
+def _page_faults() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+
+
+def _quartiles(values: list[float]) -> tuple[float, float, float]:
+    """Median, lower and upper quartile."""
+    if len(values) == 1:
+        return values[0], values[0], values[0]
+    low, middle, high = statistics.quantiles(values, n=4, method="inclusive")
+    return middle, low, high
+
+
+@dataclass(frozen=True)
+class Ceilings:
+    """What the machine can do with a number of threads, measured in this run."""
+
+    threads: int
+    copy_bytes_per_s: float
+    matrix_flop_per_s: float
+
+    def better(self, other: Ceilings) -> Ceilings:
+        """The higher of two measurements with the same number of threads."""
+        return Ceilings(
+            self.threads,
+            max(self.copy_bytes_per_s, other.copy_bytes_per_s),
+            max(self.matrix_flop_per_s, other.matrix_flop_per_s),
+        )
+
+    def record(self) -> dict[str, Any]:
+        """For the JSON file."""
+        return asdict(self) | {
+            "copy": f"torch copy_ of {COPY_BYTES} bytes, counted once as read and once as written; best block",
+            "matrix": f"float32 product of {MATRIX_SIZE} x {MATRIX_SIZE} matrices in cache, 2 n^3 FLOP; best block",
+        }
+
+
+def measure_ceilings(threads: int, min_time_s: float, copy_bytes: int = COPY_BYTES) -> Ceilings:
+    """Copy bandwidth of large blocks and rate of small matrix products.
+
+    The best of several blocks counts: disturbances only ever make a ceiling look low, and shares of it too good.
+    """
+    source = torch.ones(copy_bytes // 4)
+    target = torch.zeros_like(source)
+    left = torch.randn(MATRIX_SIZE, MATRIX_SIZE)
+    right, product = torch.randn_like(left), torch.empty_like(left)
+    timings = time_interleaved(
+        {"copy": lambda: target.copy_(source), "matrix": lambda: torch.mm(left, right, out=product)},
+        threads,
+        min_time_s,
+    )
+    best_s = {name: min(timing.round_medians_s) for name, timing in timings.items()}
+    return Ceilings(threads, 2 * source.nbytes / best_s["copy"], 2 * MATRIX_SIZE**3 / best_s["matrix"])
+
+
+def machine_record() -> dict[str, Any]:
+    """Hardware, versions, commit and settings that figures depend on."""
+    status = native_status()
+    return {
+        "machine": {
+            "cpu": _cpu_model(),
+            "cores": os.cpu_count(),
+            "caches": _caches(),
+            "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+            "system": platform.platform(),
+            "transparent_huge_pages": _read("/sys/kernel/mm/transparent_hugepage/enabled"),
+            "load_average": os.getloadavg(),
+        },
+        "versions": {"pred": pred.__version__, "torch": torch.__version__, "python": platform.python_version()},
+        "native": {name: status[name] for name in ("available", "reason", "build", "cpu_capability")},
+        "torch_cpu_capability": torch.backends.cpu.get_cpu_capability(),
+        "git": _git_record(),
+        "environment": {
+            name: value
+            for name, value in sorted(os.environ.items())
+            if name.startswith(("PRED_", "MALLOC_", "OMP_", "GOMP_", "MKL_", "KMP_", "ATEN_", "TORCHINDUCTOR_", "LD_P"))
+        },
+    }
+
+
+def _read(path: str) -> str | None:
+    try:
+        return Path(path).read_text().strip()
+    except OSError:
+        return None
+
+
+def _cpu_model() -> str:
+    for line in (_read("/proc/cpuinfo") or "").splitlines():
+        if line.startswith("model name"):
+            return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _caches() -> dict[str, str]:
+    """Sizes of the first core's caches."""
+    sizes = {}
+    for folder in sorted(Path("/sys/devices/system/cpu/cpu0/cache").glob("index*")):
+        level, kind, size = (_read(str(folder / name)) for name in ("level", "type", "size"))
+        if kind != "Instruction" and level and size:
+            sizes[f"L{level}"] = size
+    return sizes
+
+
+def _git_record() -> dict[str, Any]:
+    """Commit of the sources and whether they differ from it; None where there is no repository."""
+    git = ["git", "--no-optional-locks", "-C", str(Path(__file__).resolve().parent)]
+    try:
+        commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+        command = [*git, "status", "--porcelain", "--", ":/", f":(top,exclude){RESULTS}"]
+        status = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return {"commit": None, "dirty": None}
+    return {"commit": commit, "dirty": bool(status)}

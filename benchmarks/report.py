@@ -1,0 +1,245 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a run found: rows, their comparison with each other and with the machine's ceilings, and the printed tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from benchmarks.measure import Ceilings, Timing
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a phase should reach: so many times the speed of a contender, a share of a ceiling, or a part of the memory
+    (4: a quarter)."""
+
+    against: Literal["eager", "compiled", "copy bandwidth", "matrix rate", "eager's memory"]
+    at_least: float
+
+
+@dataclass
+class Row:
+    """One contender in one phase of one case."""
+
+    op: str
+    case: str
+    phase: str
+    threads: int
+    contender: str
+    kind: str
+    """``ours``, ``eager``, ``compiled``, or ``reference``."""
+    unit: str
+    items: int
+    """Number of `unit`s in one call."""
+    traffic: str = ""
+    """Formula of the least bytes moved."""
+    traffic_bytes: int = 0
+    work: str = ""
+    """Formula of the useful arithmetic, where matrix products are the limit."""
+    flop: int = 0
+    status: str = "ok"
+    """``ok``, or why there is no time: ``refused: ...``, ``missing: ...``, ``wrong: ...``."""
+    error: float | None = None
+    """Largest difference to the reference, relative to the largest magnitude of each result."""
+    timing: Timing | None = None
+    peak_memory_bytes: int | None = None
+    """Added to what the process held before."""
+    targets: tuple[Target, ...] = ()
+
+    def record(self, ceilings: Mapping[int, Ceilings]) -> dict[str, Any]:
+        """For the JSON file: all of it, and rates."""
+        record = asdict(self)
+        del record["targets"]
+        record["timing"] = self.timing.record() if self.timing else None
+        record["rates"] = self.rates(ceilings)
+        return record
+
+    def rates(self, ceilings: Mapping[int, Ceilings]) -> dict[str, float] | None:
+        """Work per second, and shares of the ceilings with the same number of threads."""
+        if self.timing is None:
+            return None
+        seconds, ceiling = self.timing.median_s, ceilings[self.threads]
+        rates = {"items_per_s": self.items / seconds}
+        if self.traffic_bytes:
+            rates["bytes_per_s"] = self.traffic_bytes / seconds
+            rates["copy_share"] = rates["bytes_per_s"] / ceiling.copy_bytes_per_s
+        if self.flop:
+            rates["flop_per_s"] = self.flop / seconds
+            rates["matrix_share"] = rates["flop_per_s"] / ceiling.matrix_flop_per_s
+        return rates
+
+
+def compare(rows: Sequence[Row], ceilings: Mapping[int, Ceilings]) -> list[dict[str, Any]]:
+    """Ours against the fastest of each other kind, phase by phase, and against the targets."""
+    groups: dict[tuple[str, str, int], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.case, row.phase, row.threads), []).append(row)
+    comparisons = []
+    for (case, phase, threads), group in groups.items():
+        timed = [row for row in group if row.timing is not None]
+        best = {
+            kind: min((row for row in timed if row.kind == kind), key=_median, default=None)
+            for kind in ("ours", "reference", "eager", "compiled")
+        }
+        ours = best.pop("ours")
+        comparison: dict[str, Any] = {"op": group[0].op, "case": case, "phase": phase, "threads": threads}
+        against = {kind: _speedup(ours, other) for kind, other in best.items() if ours and other}
+        comparison["speedup"] = against
+        rates = (ours.rates(ceilings) if ours else None) or {}
+        reached = {kind: speedup["ratio"] for kind, speedup in against.items()}
+        reached |= {
+            name: rates[key]
+            for name, key in (("copy bandwidth", "copy_share"), ("matrix rate", "matrix_share"))
+            if key in rates
+        }
+        eager = best["eager"]
+        if ours and eager and ours.peak_memory_bytes and eager.peak_memory_bytes:
+            reached["eager's memory"] = eager.peak_memory_bytes / ours.peak_memory_bytes
+        comparison["targets"] = [
+            asdict(target)
+            | {
+                "reached": reached.get(target.against),
+                "met": reached[target.against] >= target.at_least if target.against in reached else None,
+            }
+            for target in group[0].targets
+        ]
+        comparisons.append(comparison)
+    return comparisons
+
+
+def _median(row: Row) -> float:
+    assert row.timing is not None
+    return row.timing.median_s
+
+
+def _speedup(ours: Row, other: Row) -> dict[str, Any]:
+    """How many times faster ours is: by the medians, and in the worst and best of the rounds."""
+    assert ours.timing is not None and other.timing is not None
+    by_round = [
+        theirs / mine for theirs, mine in zip(other.timing.round_medians_s, ours.timing.round_medians_s, strict=False)
+    ]
+    return {
+        "contender": other.contender,
+        "ratio": other.timing.median_s / ours.timing.median_s,
+        "lowest_round": min(by_round),
+        "highest_round": max(by_round),
+    }
+
+
+def format_rows(rows: Sequence[Row], ceilings: Mapping[int, Ceilings]) -> str:
+    """The table of contenders."""
+    header = ["case", "phase", "threads", "contender", "ms", "IQR ms", "rate", "GB/s", "of ceiling", "peak MB", ""]
+    lines = []
+    previous = ""
+    for row in rows:
+        shown = "" if row.case == previous else row.case
+        previous = row.case
+        line = [shown, row.phase, str(row.threads), row.contender]
+        rates = row.rates(ceilings)
+        if row.timing is None or rates is None:
+            lines.append([*line, "-", "", "", "", "", "", row.status])
+            continue
+        ceiling = ""
+        if "copy_share" in rates:
+            ceiling = f"{rates['copy_share']:.0%} copy"
+        elif "matrix_share" in rates:
+            ceiling = f"{rates['matrix_share']:.0%} matrix"
+        lines.append(
+            [
+                *line,
+                f"{1e3 * row.timing.median_s:.3f}",
+                f"{1e3 * (row.timing.q75_s - row.timing.q25_s):.3f}",
+                f"{_short(rates['items_per_s'])} {row.unit}/s",
+                f"{rates['bytes_per_s'] / 1e9:.2f}" if "bytes_per_s" in rates else "",
+                ceiling,
+                f"{row.peak_memory_bytes / 1e6:.0f}" if row.peak_memory_bytes is not None else "",
+                "" if row.status == "ok" else row.status,
+            ]
+        )
+    return format_table(header, lines, right=(2, 4, 5, 6, 7, 8, 9))
+
+
+def format_comparisons(
+    comparisons: Sequence[Mapping[str, Any]], default_allocator: Sequence[Mapping[str, Any]] = ()
+) -> str:
+    """The table of ratios and targets, with the default allocator's ratio beside."""
+    others = {_key(comparison): comparison for comparison in default_allocator}
+    header = ["case", "phase", "threads", "vs eager", "rounds", "vs compiled", "default malloc: vs eager", "target"]
+    lines = []
+    previous = ""
+    for comparison in comparisons:
+        shown = "" if comparison["case"] == previous else comparison["case"]
+        previous = comparison["case"]
+        eager = comparison["speedup"].get("eager")
+        lines.append(
+            [
+                shown,
+                comparison["phase"],
+                str(comparison["threads"]),
+                _ratio(comparison, "eager"),
+                f"{eager['lowest_round']:.1f} to {eager['highest_round']:.1f}" if eager else "",
+                _ratio(comparison, "compiled"),
+                _ratio(others.get(_key(comparison), {"speedup": {}}), "eager"),
+                "; ".join(_verdict(target) for target in comparison["targets"]),
+            ]
+        )
+    return format_table(header, lines, right=(2, 3, 4, 5, 6))
+
+
+def format_ceilings(ceilings: Mapping[int, Ceilings]) -> str:
+    """The measured ceilings."""
+    lines = [
+        [str(threads), f"{item.copy_bytes_per_s / 1e9:.1f} GB/s", f"{item.matrix_flop_per_s / 1e9:.1f} GFLOP/s"]
+        for threads, item in ceilings.items()
+    ]
+    return format_table(["threads", "copy bandwidth", "matrix rate"], lines, right=(0, 1, 2))
+
+
+def format_table(header: Sequence[str], lines: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
+    """Columns aligned by spaces, those in ``right`` to the right; columns without content are left out."""
+    columns = [column for column in range(len(header)) if any(line[column] for line in lines)]
+    widths = {column: max(len(line[column]) for line in [header, *lines]) for column in columns}
+
+    def aligned(line: Sequence[str]) -> str:
+        cells = (
+            line[column].rjust(widths[column]) if column in right else line[column].ljust(widths[column])
+            for column in columns
+        )
+        return "  ".join(cells).rstrip()
+
+    rule = "  ".join("-" * widths[column] for column in columns)
+    return "\n".join([aligned(header), rule, *(aligned(line) for line in lines)])
+
+
+def _key(comparison: Mapping[str, Any]) -> tuple[str, str, int]:
+    return comparison["case"], comparison["phase"], comparison["threads"]
+
+
+def _ratio(comparison: Mapping[str, Any], kind: str) -> str:
+    speedup = comparison["speedup"].get(kind)
+    return f"{speedup['ratio']:.2f}x" if speedup else ""
+
+
+def _verdict(target: Mapping[str, Any]) -> str:
+    against, at_least, reached = target["against"], target["at_least"], target["reached"]
+    if against in ("copy bandwidth", "matrix rate"):
+        wanted, reached = f"{at_least:.0%} of {against}", reached and f"{reached:.0%}"
+    elif against == "eager's memory":
+        wanted, reached = f"1/{at_least:g} of {against}", reached and f"1/{reached:.2f}"
+    else:
+        wanted, reached = f"{at_least:g}x {against}", reached and f"{reached:.2f}x"
+    if reached is None:
+        return f"{wanted}: not measured"
+    return f"{wanted}: {'met' if target['met'] else 'falls short'} ({reached})"
+
+
+def _short(value: float) -> str:
+    for factor, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if value >= factor:
+            return f"{value / factor:.3g}{letter}"
+    return f"{value:.3g}"

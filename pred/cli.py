@@ -1,0 +1,141 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""The `pred` command: one sub-command per job. Each reads its arguments and hands over; the work is elsewhere.
+
+Imports that cost time stay inside the sub-commands, so that help and errors come at once.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+def pretrain(arguments: list[str]) -> None:
+    from pred.config import build, config_parser
+    from pred.pretrain import PretrainConfig
+    from pred.pretrain import pretrain as run_pretraining
+    from pred.run_folder import RunFolder
+
+    parser = config_parser("pred pretrain", "Pre-train a LiDAR encoder by rendering.", PretrainConfig)
+    parser.add_argument("--resume", type=Path | None, default=None, help="run folder to continue, from its config.yaml")
+    parsed = parser.parse_args(arguments)
+    if parsed.resume is not None:
+        folder = RunFolder(Path(parsed.resume))
+        folder.require()
+        parsed = parser.parse_args([f"--config={folder.config}", *arguments, f"--run={folder.path}"])
+    run_pretraining(build(parser, PretrainConfig, parsed), resume=parsed.resume is not None)
+
+
+def evaluate(arguments: list[str]) -> None:
+    from pred.evaluate import evaluate_rendering
+
+    def add_options(parser: Any) -> None:
+        parser.add_argument("what", choices=["rendering"], help="rendering: depth and semantics of held-out returns")
+        parser.add_argument(
+            "--frames", type=int | None, default=None, help="evaluate only the first frames; all by default"
+        )
+
+    options, config = _options_of_run(
+        "pred evaluate",
+        "Compare a run with held-out returns, with a simple baseline and with an untrained network.",
+        arguments,
+        add_options,
+    )
+    evaluate_rendering(config, Path(options.folder), checkpoint=options.checkpoint, max_frames=options.frames)
+
+
+def view(arguments: list[str]) -> None:
+    from pred.view import view as make_pictures
+
+    def add_options(parser: Any) -> None:
+        parser.add_argument("--frame", type=int, default=0, help="index of the frame in the data set")
+        parser.add_argument("--columns", type=int, default=200, help="rays per image row (200: 1/8 of 1600 pixels)")
+
+    options, config = _options_of_run(
+        "pred view", "Pictures of what a run renders: one per camera, one from above.", arguments, add_options
+    )
+    make_pictures(
+        config, Path(options.folder), checkpoint=options.checkpoint, frame_index=options.frame, columns=options.columns
+    )
+
+
+def doctor(arguments: list[str]) -> None:
+    from argparse import ArgumentParser
+
+    ArgumentParser(
+        "pred doctor", description="Show versions, backend, CPU and GPU, and why something is missing."
+    ).parse_args(arguments)
+    from pred.doctor import print_report
+
+    print_report()
+
+
+class Command(NamedTuple):
+    function: Callable[[list[str]], None]
+    summary: str
+
+
+COMMANDS = {
+    "pretrain": Command(pretrain, "pre-train a LiDAR encoder; --resume RUN continues"),
+    "evaluate": Command(evaluate, "evaluate rendering RUN: errors on held-out returns"),
+    "view": Command(view, "view RUN: pictures of what the run renders"),
+    "doctor": Command(doctor, "versions, backend, machine, and what is missing"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a sub-command; returns the exit status (0 done, 1 failed, 2 wrong usage)."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    name = arguments.pop(0) if arguments else "--help"
+    if name in ("-h", "--help"):
+        print(_usage())
+        return 0
+    if name == "--version":
+        from pred import __version__
+
+        print(f"pred {__version__}")
+        return 0
+    if name not in COMMANDS:
+        nearest = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"; did you mean {nearest[0]}?" if nearest else ""
+        print(f"pred: error: unknown command {name!r}{hint}\n\n{_usage()}", file=sys.stderr)
+        return 2
+    try:
+        COMMANDS[name].function(arguments)
+    except KeyboardInterrupt:
+        return 130
+    # Text for people: these errors say what is wrong with an argument or a file.
+    except (ValueError, OSError, RuntimeError) as error:
+        if os.environ.get("PRED_TRACEBACK"):
+            raise
+        print(f"pred {name}: error: {error}\n(PRED_TRACEBACK=1 shows the traceback)", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _options_of_run(
+    prog: str, description: str, arguments: list[str], add_options: Callable[[Any], None]
+) -> tuple[Any, Any]:
+    """Options and configuration of a command that works on a run folder: RUN/config.yaml, then the command line."""
+    from pred.config import build, config_parser
+    from pred.pretrain import PretrainConfig
+    from pred.run_folder import RunFolder
+
+    parser = config_parser(prog, f"{description} Keys such as --data.root override the run's own.", PretrainConfig)
+    add_options(parser)
+    parser.add_argument("folder", metavar="RUN", help="run folder")
+    parser.add_argument("--checkpoint", type=Path | None, default=None, help="file to use; the run's latest by default")
+    folder = RunFolder(Path(parser.parse_args(arguments).folder))
+    folder.require()
+    parsed = parser.parse_args([f"--config={folder.config}", *arguments])
+    return parsed, build(parser, PretrainConfig, parsed)
+
+
+def _usage() -> str:
+    lines = [f"  {name:<10} {command.summary}" for name, command in COMMANDS.items()]
+    return "usage: pred COMMAND [options]    (pred COMMAND --help for its options)\n\n" + "\n".join(lines)

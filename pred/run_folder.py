@@ -1,0 +1,208 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a run leaves on disk: resolved configuration, versions, logs, checkpoints, pictures, weights.
+
+RUN/config.yaml                 resolved configuration
+RUN/run.json                    versions, commit, seed, command, frames; one entry per resume
+RUN/log.csv                     loss terms by step; the same bytes with and without an interruption
+RUN/timing.csv                  rates by step
+RUN/tensorboard/                the same for TensorBoard
+RUN/checkpoints/step_*.pt       see `pred.checkpoint`
+RUN/encoder.pth                 the product, once training has ended
+RUN/pictures/, RUN/*.json       made by `pred view` and `pred evaluate`
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import torch
+
+import pred
+from pred._native import native_status
+from pred.checkpoint import write_text
+
+
+class RunFolderError(RuntimeError):
+    """A run folder is missing, incomplete, or already in use."""
+
+
+@dataclass
+class RunFolder:
+    """Paths of one run."""
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        return self.path / "config.yaml"
+
+    @property
+    def info(self) -> Path:
+        return self.path / "run.json"
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def pictures(self) -> Path:
+        return self.path / "pictures"
+
+    @property
+    def encoder(self) -> Path:
+        return self.path / "encoder.pth"
+
+    def start(self, config_yaml: str) -> None:
+        """Make the folder and write its configuration.
+
+        Raises:
+            RunFolderError: it already holds a run.
+        """
+        held = [name for name in ("config.yaml", "checkpoints", "log.csv") if (self.path / name).exists()]
+        if held:
+            raise RunFolderError(
+                f"{self.path}: run folder must be new, got one that already holds {held[0]}; "
+                f"continue it with: pred pretrain --resume {self.path}"
+            )
+        self.path.mkdir(parents=True, exist_ok=True)
+        write_text(self.config, config_yaml)
+
+    def require(self) -> None:
+        """
+        Raises:
+            RunFolderError: there is no run in this folder.
+        """
+        if not self.path.is_dir():
+            raise RunFolderError(f"{self.path}: run folder must exist, got no such folder")
+        if not self.config.is_file():
+            raise RunFolderError(f"{self.path}: run folder must hold config.yaml, got none: no run was started here")
+
+    def record_start(self, facts: Mapping[str, Any], resumed_step: int | None) -> None:
+        """Add this process to run.json; a resumed run keeps the record of its first start."""
+        record = {
+            "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+            "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+            **environment(),
+            **facts,
+        }
+        content: dict[str, Any] = {}
+        if resumed_step is not None and self.info.is_file():
+            content = json.loads(self.info.read_text())
+            content.setdefault("resumed", []).append({"step": resumed_step, **record})
+        else:
+            content = record
+        write_json(self.info, content)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Replace ``path`` with ``content`` as indented JSON, atomically."""
+    write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def environment() -> dict[str, Any]:
+    """What decides the bits of a run besides its configuration: versions, backend, threads."""
+    status = native_status()
+    return {
+        "versions": {
+            "pred": pred.__version__,
+            "python": platform.python_version(),
+            **{name: _version(name) for name in ("torch", "numpy", "lightning-fabric")},
+        },
+        "commit": _commit(),
+        "backend": os.environ.get("PRED_BACKEND", "auto"),
+        "native": status["available"],
+        "cpu_capability": status["cpu_capability"],
+        "threads": torch.get_num_threads(),
+        "machine": platform.machine(),
+    }
+
+
+class CsvLog:
+    """A CSV file with one row per logged step, flushed row by row.
+
+    Args:
+        path: the file; rows of steps after ``last_step`` (written before a kill, after the checkpoint) are cut.
+        last_step: steps done so far.
+    """
+
+    def __init__(self, path: Path, last_step: int) -> None:
+        self._columns: list[str] | None = None
+        if path.exists():
+            self._columns = _cut_rows(path, last_step)
+        self._file = open(path, "a", newline="")
+
+    def write(self, row: Mapping[str, int | float]) -> None:
+        """Add a row. The first row of a file fixes the columns; each further one must have the same."""
+        if self._columns is None:
+            self._columns = list(row)
+            self._write_line(self._columns)
+        if list(row) != self._columns:
+            raise ValueError(f"CsvLog: row must have the columns {self._columns}, got {list(row)}")
+        self._write_line(row.values())
+
+    def _write_line(self, values: Any) -> None:
+        csv.writer(self._file, lineterminator="\n").writerow(values)
+        self._file.flush()
+
+    def sync(self) -> None:
+        """Make the rows durable: before a checkpoint, so that it never knows more steps than its log."""
+        os.fsync(self._file.fileno())
+
+    def __enter__(self) -> CsvLog:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+
+def _cut_rows(path: Path, last_step: int) -> list[str] | None:
+    text = path.read_text()
+    # A killed writer may leave half a line.
+    complete = text[: text.rfind("\n") + 1]
+    rows = list(csv.reader(io.StringIO(complete)))
+    if not rows:
+        write_text(path, "")
+        return None
+    lines = complete.splitlines(keepends=True)
+    kept = [line for line, row in zip(lines[1:], rows[1:], strict=True) if int(row[0]) <= last_step]
+    write_text(path, lines[0] + "".join(kept))
+    return rows[0]
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """Commit of the checkout this package lies in ("-dirty" if changed), or None outside of one."""
+    folder = Path(pred.__file__).resolve().parent
+    try:
+        # A package installed below somebody else's checkout is not tracked there.
+        _git(folder, "ls-files", "--error-unmatch", "__init__.py")
+        return _git(folder, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(folder), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()

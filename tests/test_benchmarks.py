@@ -1,0 +1,286 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""The benchmark tool: every case runs at its tiniest size, and what is reported follows from what was measured."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from benchmarks import bench_ops, bench_step, cases
+from benchmarks.__main__ import parse
+from benchmarks.bench_ops import BACKWARD, FORWARD, SECOND, Variant, expected_results, make_cases, run_phase
+from benchmarks.cases import REAL, TINY
+from benchmarks.measure import Ceilings, Timing, time_interleaved
+from benchmarks.report import Row, Target, compare, format_comparisons, format_rows, format_table
+from pred import _native
+
+ROOT = Path(__file__).resolve().parent.parent
+PHASES = {
+    "sample_bev": {FORWARD, BACKWARD, SECOND},
+    "sdf_to_alpha": {FORWARD, BACKWARD},
+    "composite_rays": {FORWARD, BACKWARD},
+    "resample_rays": {FORWARD},
+    "voxelize": {FORWARD},
+    "segment_reduce": {FORWARD, BACKWARD},
+    "step": {BACKWARD},
+}
+
+
+def run_cli(*arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("MALLOC_", "PRED_B"))}
+    return subprocess.run(
+        [sys.executable, "-m", "benchmarks", *arguments], cwd=ROOT, env=environment, capture_output=True, text=True
+    )
+
+
+def check_rows(rows: list[dict[str, Any]]) -> None:
+    for row in rows:
+        name = f"{row['case']}, {row['phase']}, {row['contender']}: {row['status']}"
+        if row["kind"] == "ours" and not _native.available():
+            assert row["status"].startswith("missing: "), name
+            continue
+        assert row["status"] == "ok", name
+        timing = row["timing"]
+        assert 0 < timing["q25_s"] <= timing["median_s"] <= timing["q75_s"], name
+        assert timing["samples"] >= len(timing["round_medians_s"]) == 3, name
+        assert row["error"] is not None and row["error"] < 1e-3, name
+        assert row["items"] > 0 and row["rates"]["items_per_s"] == pytest.approx(row["items"] / timing["median_s"])
+        assert (row["traffic_bytes"] > 0 and row["traffic"]) or (row["flop"] > 0 and row["work"]), name
+
+
+def test_every_case_runs(tmp_path: Path) -> None:
+    out = tmp_path / "folder" / "result.json"
+    command = ["--sizes", "tiny", "--threads", "1", "--quick", "--min-time", "0.005", "--contenders", "ours,eager"]
+    done = run_cli(*command, "--out", str(out))
+    assert done.returncode == 0, done.stderr
+    assert "about" in done.stderr and "ceilings" in done.stderr
+
+    result = json.loads(out.read_text())
+    assert result["complete"] and result["schema"] == 1 and result["allocator"] == "raised"
+    assert result["command"] == "python -m benchmarks " + " ".join([*command, "--out", str(out)])
+    assert result["environment"]["MALLOC_MMAP_THRESHOLD_"] == result["environment"]["MALLOC_TRIM_THRESHOLD_"]
+    assert result["versions"]["torch"] == torch.__version__
+    assert result["machine"]["cores"] == os.cpu_count() and result["machine"]["memory_bytes"] > 1e9
+    assert result["native"]["available"] == _native.available()
+    assert set(result["git"]) == {"commit", "dirty"}
+    (ceilings,) = result["ceilings"]
+    assert ceilings["threads"] == 1
+    assert ceilings["copy_bytes_per_s"] > 1e8 and ceilings["matrix_flop_per_s"] > 1e8
+
+    check_rows(result["rows"])
+    for op, phases in PHASES.items():
+        assert {row["phase"] for row in result["rows"] if row["op"] == op} == phases
+    for row in result["rows"]:
+        assert row["case"] in done.stdout and row["contender"] in done.stdout
+    if _native.available():
+        for comparison in result["comparisons"]:
+            assert comparison["speedup"]["eager"]["ratio"] > 0, comparison
+            assert comparison["targets"] == []  # they belong to the real sizes
+    step = {row["contender"]: row for row in result["rows"] if row["op"] == "step"}
+    assert step["eager"]["peak_memory_bytes"] > 0 and step["reference"]["peak_memory_bytes"] > 0
+
+
+def test_default_allocator_runs_beside(tmp_path: Path) -> None:
+    out = tmp_path / "result.json"
+    command = ["--ops", "resample_rays", "--sizes", "tiny", "--threads", "1", "--contenders", "ours,eager"]
+    done = run_cli(*command, "--min-time", "0.005", "--out", str(out))
+    assert done.returncode == 0, done.stderr
+    default = json.loads(out.read_text())["default_allocator"]
+    assert default["allocator"] == "default"
+    assert not any(name.startswith("MALLOC_") for name in default["environment"])
+    assert {row["kind"] for row in default["rows"]} == {"ours", "eager"}
+    check_rows(default["rows"])
+
+
+def test_compiled_runs_or_says_why_not() -> None:
+    (case,) = make_cases("sdf_to_alpha", TINY)
+    phase = case.phases[0]
+    (row,) = run_phase(case, phase, expected_results(case, phase), 1, ["compiled"], 0.005, 3, lambda step: None)
+    assert row.contender == "compiled closed form"
+    assert (row.status == "ok" and row.timing is not None) or row.status.startswith("refused: "), row.status
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--ops", "sample_bev,nothing"], "must name some of sample_bev"),
+        (["--threads", "0"], "must be positive numbers"),
+        (["--threads", "two"], "must be positive numbers"),
+        (["--min-time", "0"], "must be above 0, got 0.0"),
+        (["--sizes", "huge"], "invalid choice: 'huge'"),
+    ],
+)
+def test_wrong_arguments(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        parse(arguments)
+    assert message in capsys.readouterr().err
+
+
+def test_a_wrong_result_gets_no_time() -> None:
+    (case, *_) = make_cases("resample_rays", TINY)
+    off = {"off": Variant(lambda t, weights: (case.eager["searchsorted + sort"].function(t, weights)[0] * 1.01,))}
+    steps: list[str] = []
+    (row,) = run_phase(
+        replace(case, eager=off),
+        case.phases[0],
+        expected_results(case, case.phases[0]),
+        threads=1,
+        kinds=["eager"],
+        min_time_s=0.001,
+        rounds=3,
+        on_step=steps.append,
+    )
+    assert row.status.startswith("wrong: result 0 differs by 0.01") and row.timing is None
+    assert [step.rsplit(": ", 1)[1] for step in steps] == ["eager off", "timing"]
+
+
+def test_a_refusing_contender_is_noted() -> None:
+    (case, *_) = make_cases("sdf_to_alpha", TINY)
+
+    def refuse(*inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        raise NotImplementedError("not for these\nsecond line")
+
+    expected = expected_results(case, case.phases[1])
+    broken = replace(case, eager={"broken": Variant(refuse), **case.eager})
+    rows = run_phase(broken, case.phases[1], expected, 1, ["eager"], 0.001, 3, lambda step: None)
+    assert [row.status for row in rows] == ["refused: NotImplementedError: not for these", "ok"]
+
+
+def test_contenders_take_turns() -> None:
+    calls: list[str] = []
+
+    def slow(name: str) -> None:
+        calls.append(name)
+
+    timings = time_interleaved({"a": lambda: slow("a"), "b": lambda: slow("b")}, 1, min_time_s=0.1, rounds=4)
+    turns = [name for name, before in zip(calls, ["", *calls], strict=False) if name != before]
+    assert turns == ["a", "b"] * 4
+    assert all(len(timing.round_medians_s) == 4 for timing in timings.values())
+
+
+def test_traffic_formulas() -> None:
+    (bev, _) = make_cases("sample_bev", TINY)
+    height_width_channels, samples, rows = 12 * 12 * 8, 64, 64 * 8
+    assert [phase.traffic_bytes for phase in bev.phases] == [
+        4 * (height_width_channels + 2 * samples + rows),
+        4 * (3 * height_width_channels + 6 * samples + 2 * rows),
+        4 * (4 * height_width_channels + 12 * samples + 5 * rows),
+    ]
+    depth, classes = make_cases("composite_rays", TINY)
+    assert [phase.traffic_bytes for phase in depth.phases] == [4 * 3 * 5 * 14, 4 * 6 * 5 * 14]
+    assert [phase.traffic_bytes for phase in classes.phases] == [4 * (3 + 19) * 5 * 14, 4 * (6 + 3 * 19) * 5 * 14]
+    (resample,) = make_cases("resample_rays", TINY)
+    assert resample.phases[0].traffic_bytes == 4 * 5 * (3 * 6 + 8)
+
+
+def test_useful_flop() -> None:
+    trunk, head = 39 * 256 + 2 * 256**2, 256  # 141 056 multiply-adds, and 256 per output row
+    coarse = 2 * 96 * (trunk + head)
+    depth = 224 * 6 * (trunk + head)
+    semantic = 224 * 3 * (trunk + 20 * head)
+    assert coarse + depth + semantic == 315_285_504
+    assert bench_step.useful_flop(REAL) == 2 * (512 * 315_285_504 + 3 * 32_400 * 128 * 256)
+
+
+def timing(*round_medians_s: float) -> Timing:
+    median_s = sorted(round_medians_s)[len(round_medians_s) // 2]
+    return Timing(median_s, median_s, median_s, len(round_medians_s), list(round_medians_s), 0.0)
+
+
+def row(contender: str, kind: str, times: Timing | None, memory: int | None = None) -> Row:
+    return Row(
+        op="op",
+        case="case",
+        phase=BACKWARD,
+        threads=2,
+        contender=contender,
+        kind=kind,
+        unit="rays",
+        items=1000,
+        traffic_bytes=8000,
+        timing=times,
+        status="ok" if times else "refused: no",
+        peak_memory_bytes=memory,
+        targets=(
+            Target("eager", 3.0),
+            Target("compiled", 2.0),
+            Target("copy bandwidth", 0.5),
+            Target("eager's memory", 4.0),
+        ),
+    )
+
+
+def test_comparison_is_with_the_fastest_eager_and_against_the_targets() -> None:
+    ceilings = {2: Ceilings(2, copy_bytes_per_s=1e6, matrix_flop_per_s=1e9)}
+    rows = [
+        row("ours", "ours", timing(0.01, 0.02, 0.03), memory=100),
+        row("eager slow", "eager", timing(0.1, 0.1, 0.1)),
+        row("eager fast", "eager", timing(0.05, 0.06, 0.06), memory=300),
+        row("compiled x", "compiled", None),
+    ]
+    (comparison,) = compare(rows, ceilings)
+    assert comparison["speedup"] == {
+        "eager": {
+            "contender": "eager fast",
+            "ratio": pytest.approx(3.0),
+            "lowest_round": pytest.approx(2.0),
+            "highest_round": pytest.approx(5.0),
+        }
+    }
+    verdicts = {target["against"]: (target["reached"], target["met"]) for target in comparison["targets"]}
+    assert verdicts == {
+        "eager": (pytest.approx(3.0), True),
+        "compiled": (None, None),
+        "copy bandwidth": (pytest.approx(0.4), False),  # 8000 bytes in 0.02 s of 1e6 per second
+        "eager's memory": (pytest.approx(3.0), False),
+    }
+    shown = format_comparisons([comparison])
+    assert "3x eager: met (3.00x); 2x compiled: not measured" in shown
+    assert "50% of copy bandwidth: falls short (40%); 1/4 of eager's memory: falls short (1/3.00)" in shown
+    table = format_rows(rows, ceilings)
+    assert "50k rays/s" in table and "40% copy" in table and "refused: no" in table
+
+
+def test_table_is_aligned() -> None:
+    assert format_table(["a", "empty", "b"], [["long", "", "1"], ["x", "", "23"]], right=(2,)).splitlines() == [
+        "a      b",
+        "----  --",
+        "long   1",
+        "x     23",
+    ]
+
+
+def test_inputs_are_what_they_claim() -> None:
+    points = cases.lidar_points(100_000)
+    low, high = torch.tensor(cases.POINT_RANGE_M).view(2, 3)
+    assert points.shape == (100_000, 5) and bool(((points[:, :3] >= low) & (points[:, :3] < high)).all())
+    assert torch.equal(points, cases.lidar_points(100_000))
+    assert not torch.equal(points, cases.lidar_points(100_000, seed=1))
+    assert points[:, 4].unique().numel() > 1  # several sweeps
+
+    rays = cases.ray_samples(TINY)
+    assert bool((rays.t.diff(dim=1) >= 0).all()) and bool((rays.sdf[:, 0] > 0).all())
+    coarse = cases.coarse_rays(TINY)
+    assert coarse.t.shape == (5, 6) and bool((coarse.weights[:, -1] == 0).all())
+    assert bool((coarse.weights.sum(dim=1) <= 1 + 1e-6).all())
+
+    for grid in (cases.ray_grid(REAL), cases.scattered_grid(REAL)):
+        cell = ((grid.double() + 1) * 180 - 1) / 2
+        assert grid.shape == (1, 65536, 2) and float(grid.abs().max()) < 1.02
+        assert float((cell - cell.round()).abs().min()) > 0.009  # off the lines where the derivative jumps
+    assert cases.bev_map(8, 12).is_contiguous(memory_format=torch.channels_last)
+
+
+def test_every_op_has_a_case() -> None:
+    from pred import ops
+
+    assert {name for name in ops.__all__ if name.islower()} == set(bench_ops.CASES)

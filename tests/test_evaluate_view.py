@@ -1,0 +1,309 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tiny_run import tiny_config
+from torch import Tensor
+
+from pred import cli
+from pred.data.batch import TrainingBatches, build_source, evaluation_batch
+from pred.data.frame import CLASS_NAMES, Boxes, Camera, Frame
+from pred.data.masking import is_held_out
+from pred.data.world import StreetFrames
+from pred.evaluate import Scores, add_scores, error_summary, evaluate_rendering, range_of_nearest_visible, results_table
+from pred.models.pretrainer import Pretrainer, RenderedView
+from pred.pretrain import PretrainConfig, pretrain
+from pred.view import (
+    CLASS_COLOURS,
+    FARTHEST_M,
+    NEAREST_M,
+    class_colours,
+    distance_colours,
+    draw_boxes,
+    draw_lidar_points,
+    faded,
+    pixel_rays,
+    pixels_from_above,
+    sdf_colours,
+    view,
+)
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> PretrainConfig:
+    """Of a run that has been trained a little."""
+    config = tiny_config(tmp_path_factory.mktemp("runs") / "run", steps=150, lr=1e-2, checkpoint_every=1000)
+    pretrain(config)
+    return config
+
+
+def run_of(config: PretrainConfig) -> Path:
+    assert config.run is not None
+    return Path(config.run)
+
+
+# Evaluation
+
+
+def test_evaluation_compares_trained_untrained_and_nearest(
+    config: PretrainConfig, capfd: pytest.CaptureFixture[str]
+) -> None:
+    result = evaluate_rendering(config, run_of(config))
+    assert json.loads((run_of(config) / "evaluation_rendering.json").read_text()) == result
+    assert result["frames"] == 2 and result["skipped"] == {}
+    trained, untrained = result["trained"], result["untrained"]
+    assert trained["depth_mean_m"] < untrained["depth_mean_m"]
+    assert trained["semantic_accuracy"] > untrained["semantic_accuracy"]
+    assert 0 < result["nearest_visible"]["depth_median_m"] < result["nearest_visible"]["depth_mean_m"]
+    ratio = trained["depth_mean_m"] / result["nearest_visible"]["depth_mean_m"]
+    assert trained["depth_mean_over_nearest_visible"] == pytest.approx(ratio)
+    assert sum(result["semantic_rays_by_class"].values()) == result["semantic_rays"]
+    by_class = sum(
+        trained["semantic_accuracy_by_class"][name] * n for name, n in result["semantic_rays_by_class"].items()
+    )
+    assert by_class / result["semantic_rays"] == pytest.approx(trained["semantic_accuracy"])
+    output = capfd.readouterr().out
+    for text in ("median absolute depth error", "untrained", "nearest visible", "semantic accuracy", "road ("):
+        assert text in output
+
+
+def test_evaluation_repeats_and_uses_the_checkpoint_asked_for(config: PretrainConfig, tmp_path: Path) -> None:
+    first = evaluate_rendering(config, run_of(config), max_frames=1)
+    assert evaluate_rendering(config, run_of(config), max_frames=1) == first
+    assert first["frames"] == 1
+    early = pretrain(tiny_config(tmp_path / "early", steps=1))
+    other = evaluate_rendering(config, run_of(config), next(early.glob("checkpoints/*.pt")), max_frames=1)
+    assert other["untrained"] == first["untrained"] and other["trained"] != first["trained"]
+
+
+def test_evaluated_rays_are_the_held_out_returns_and_no_others(config: PretrainConfig) -> None:
+    frame = build_source(config.data).load(0)
+    batch = evaluation_batch(frame, config.data, config.point_range, seed=0)
+    targets = (batch.depth.directions * batch.depth.depth_m[..., None])[0][batch.depth.valid[0]]
+    held = frame.points[is_held_out(frame.point_index, frame.token, config.data.holdout_fraction), :3]
+    distance = torch.cdist(targets.double(), torch.from_numpy(held).double()).min(dim=1).values
+    assert len(targets) > 300 and distance.max() < 1e-3
+    # Neither the input of the evaluation nor that of any training step holds one.
+    steps = TrainingBatches(config.data, config.point_range, 0, 6)
+    for points in [batch.points, *(steps[step].points for step in range(6) if steps[step].tokens == [frame.token])]:
+        assert torch.cdist(points[:, :3].double(), torch.from_numpy(held).double()).min() > 1e-6
+
+
+def test_scores_of_known_renderings(config: PretrainConfig) -> None:
+    frame = build_source(config.data).load(0)
+    batch = evaluation_batch(frame, config.data, config.point_range, seed=0)
+    assert batch.semantic is not None
+    semantics = batch.semantic
+    target = semantics.target
+
+    class Oracle:
+        """Right about every class but the cars, which it does not see; 0.5 m too far everywhere."""
+
+        def encode(self, points: Tensor, offsets: Tensor) -> Tensor:
+            return points
+
+        def render(self, bev: Tensor, origins: Tensor, directions: Tensor) -> RenderedView:
+            if origins is semantics.origins:
+                opacity = 1.0 - target[..., CLASS_NAMES.index("car")]
+                return RenderedView(torch.zeros_like(opacity), opacity, target * opacity[..., None])
+            opacity = torch.full_like(batch.depth.depth_m, 0.25)
+            return RenderedView(batch.depth.depth_m + 0.5, opacity, torch.zeros(0))
+
+    scores = Scores()
+    add_scores(scores, Oracle(), batch)  # type: ignore[arg-type]
+    summary = scores.summary()
+    assert summary["depth_median_m"] == pytest.approx(0.5, abs=1e-5)
+    assert summary["depth_mean_m"] == pytest.approx(0.5, abs=1e-5)
+    assert summary["opacity_mean"] == pytest.approx(0.25)
+    # A ray that sees nothing is wrong, whatever the first class is.
+    by_class = summary["semantic_accuracy_by_class"]
+    assert by_class.pop("car") == 0.0 and set(by_class.values()) == {1.0}
+    cars = float((target.argmax(-1) == CLASS_NAMES.index("car"))[semantics.valid].float().mean())
+    assert cars > 0 and summary["semantic_accuracy"] == pytest.approx(1 - cars)
+
+
+def test_nearest_visible_point_by_hand() -> None:
+    points = torch.tensor([[10.0, 0.0, 0.0], [0.0, 3.0, 4.0], [-1.0, 0.0, 0.0]])
+    directions = torch.tensor([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.8, 0.0]])
+    # The third: 53.1 degrees to -x, acos(0.48) = 61.3 degrees to (0, 0.6, 0.8).
+    assert range_of_nearest_visible(points, directions).tolist() == [10.0, 5.0, 1.0]
+    assert range_of_nearest_visible(points, directions[:0]).shape == (0,)
+    assert range_of_nearest_visible(points[:0], directions).isnan().all()
+
+
+def test_nearest_visible_point_tells_a_thousandth_of_a_degree() -> None:
+    angles = torch.deg2rad(torch.tensor([0.0, 0.001, 0.002], dtype=torch.float64))
+    ranges = torch.tensor([5.0, 6.0, 7.0])
+    points = (torch.stack([angles.cos(), angles.sin(), 0 * angles], dim=1) * ranges[:, None]).float()
+    directions = torch.stack([angles.cos(), angles.sin(), 0 * angles], dim=1).float()
+    assert torch.allclose(range_of_nearest_visible(points, directions), ranges)
+
+
+def test_nothing_to_measure_gives_none_and_no_warning() -> None:
+    empty = Scores().summary()
+    assert empty["depth_median_m"] is None and empty["semantic_accuracy"] is None and empty["opacity_mean"] is None
+    assert error_summary(np.zeros(0, np.float32)) == {"depth_median_m": None, "depth_mean_m": None}
+    result = {
+        "frames": 1, "depth_rays": 0, "semantic_rays": 0, "semantic_rays_by_class": {}, "nearest_visible": {},
+        "trained": empty, "untrained": empty,
+    }  # fmt: skip
+    assert results_table(result).row_count == 5
+
+
+def without_labels(frame: Frame) -> Frame:
+    for camera in frame.cameras:
+        camera.labels = None
+    return frame
+
+
+def test_lidar_only_run_is_evaluated_and_viewed(config: PretrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    load = StreetFrames.load
+    monkeypatch.setattr(StreetFrames, "load", lambda self, index: without_labels(load(self, index)))
+    result = evaluate_rendering(config, run_of(config), max_frames=1)
+    assert result["semantic_rays"] == 0 and result["trained"]["semantic_accuracy"] is None
+    assert result["trained"]["depth_median_m"] > 0
+    assert len(view(config, run_of(config), columns=8)) == 7
+
+
+def test_broken_frames_are_skipped_on_request(config: PretrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pred.data.frame import FrameError
+
+    load = StreetFrames.load
+
+    def load_but_the_first(self: StreetFrames, index: int) -> Frame:
+        if index == 0:
+            raise FrameError("sweep.bin", "must hold points, got 3 bytes")
+        return load(self, index)
+
+    monkeypatch.setattr(StreetFrames, "load", load_but_the_first)
+    with pytest.raises(FrameError, match=r"sweep\.bin: must hold points"):
+        evaluate_rendering(config, run_of(config))
+    monkeypatch.setattr(config.data, "on_error", "skip")
+    result = evaluate_rendering(config, run_of(config))
+    assert result["frames"] == 1 and result["skipped"] == {
+        "street-0-000000": "sweep.bin: must hold points, got 3 bytes"
+    }
+
+
+# Pictures
+
+
+def test_view_writes_a_picture_per_camera_and_one_from_above(
+    config: PretrainConfig, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["view", str(run_of(config)), "--columns", "16"]) == 0
+    output = capfd.readouterr().out
+    pictures = sorted((run_of(config) / "pictures").iterdir())
+    assert len(pictures) == 7 and pictures[-1].name == "000000_bev.png"
+    for path in pictures:
+        assert str(path) in output
+        with Image.open(path) as picture:
+            assert picture.mode == "RGB" and picture.width > 1200
+            # Something was drawn: many colours, not a black page.
+            assert len(picture.getcolors(1 << 24)) > 100
+    with Image.open(run_of(config) / "pictures" / "000000_CAM_FRONT.png") as picture:
+        colours = {colour for _, colour in picture.crop((656, 48, 1296, 408)).getcolors(1 << 24)}
+    road = tuple(CLASS_COLOURS[0].tolist())
+    assert road in colours and colours <= {tuple(colour) for colour in CLASS_COLOURS.tolist()} | {(0, 0, 0)}
+
+
+def test_pixel_rays_point_at_their_pixels(config: PretrainConfig) -> None:
+    for camera in build_source(config.data).load(1).cameras:
+        origins, directions = pixel_rays(camera, columns=4, rows=2)
+        assert np.allclose(np.linalg.norm(directions, axis=1), 1)
+        uv, z_depth_m = camera.project(origins + 7.0 * directions)
+        u = (np.arange(4) + 0.5) * camera.width / 4
+        v = (np.arange(2) + 0.5) * camera.height / 2
+        assert np.allclose(uv[:, 0].reshape(2, 4), u) and np.allclose(uv[:, 1].reshape(2, 4), v[:, None])
+        assert (z_depth_m > 0).all()
+
+
+def forward_camera() -> Camera:
+    """100 x 50 pixels, looking along +y from the LiDAR's place, 45 degrees to each side."""
+    T_camera_from_lidar = np.eye(4)
+    T_camera_from_lidar[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    return Camera("CAM", np.array([[50.0, 0, 50], [0, 50, 25], [0, 0, 1]]), T_camera_from_lidar, 100, 50)
+
+
+def frame_of(*points: tuple[float, float, float]) -> Frame:
+    array = np.zeros((len(points), 5), np.float32)
+    array[:, :3] = points
+    return Frame("t", array, np.arange(len(points)), np.ones(len(points), bool))
+
+
+def test_lidar_points_are_drawn_at_their_pixel_in_their_colour(config: PretrainConfig) -> None:
+    panel = Image.new("RGB", (200, 100))
+    # Right of the middle; left and up; behind the camera; outside of the range box.
+    frame = frame_of((5.0, 10.0, 0.0), (-4.0, 8.0, 2.0), (0.0, -10.0, 0.0), (0.0, 30.0, 0.0))
+    draw_lidar_points(panel, frame, forward_camera(), config)
+    drawn = np.argwhere(np.asarray(panel).any(axis=-1))
+    assert set(map(tuple, drawn.tolist())) == {
+        (v + dv, u + du) for v, u in ((50, 150), (25, 50)) for dv in (-1, 0, 1) for du in (-1, 0, 1)
+    }
+    assert panel.getpixel((150, 50)) == tuple(distance_colours(np.array([math.sqrt(125)]))[0].tolist())
+
+
+def test_from_above_forward_is_up_and_right_is_right(config: PretrainConfig) -> None:
+    panel = Image.new("RGB", (512, 512))  # of +-25.6 m: 10 pixels per metre
+    pixels = pixels_from_above(np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 20.0]]), panel, config)
+    assert np.allclose(pixels, [[256, 256], [356, 256], [256, 56]])
+
+
+def test_boxes_are_drawn_around_their_centre(config: PretrainConfig) -> None:
+    panel = Image.new("RGB", (512, 512))
+    boxes = Boxes(np.array([[5.0, 5.0, 0.0]]), np.array([[4.0, 2.0, 1.5]]), np.array([math.pi / 2]), ["car"])
+    draw_boxes(panel, boxes, config)  # heading up: 2 m wide, 4 m long
+    rows, columns = np.nonzero(np.asarray(panel).any(axis=-1))
+    assert (columns.min(), columns.max()) == (296, 316) and (rows.min(), rows.max()) == (186, 226)
+
+
+def test_colours_of_distances() -> None:
+    middle = math.sqrt(NEAREST_M * FARTHEST_M)
+    colours = distance_colours(np.array([0.0, NEAREST_M, middle, FARTHEST_M, 1e9])).astype(int)
+    assert (colours[0] == colours[1]).all() and (colours[3] == colours[4]).all()
+    assert colours[1][0] > colours[1][2] and colours[3][2] > colours[3][1]  # near is red, far is blue
+    assert (np.abs(colours[2] - colours[1]).sum() > 100) and (np.abs(colours[2] - colours[3]).sum() > 100)
+
+
+def test_colours_of_classes_opacity_and_signed_distance() -> None:
+    assert class_colours(np.array([[0, 255]], np.uint8)).tolist() == [[[128, 64, 128], [0, 0, 0]]]
+    assert len(CLASS_COLOURS) == len(CLASS_NAMES) == len(set(map(tuple, CLASS_COLOURS.tolist())))
+    colours = np.full((1, 3, 3), 200, np.uint8)
+    assert faded(colours, np.array([[1.0, 0.0, 0.5]]))[0, :, 0].tolist() == [200, 60, 130]
+    outside, inside = sdf_colours(np.array([[0.4, 0.45], [-0.4, -0.45]]))[:, 1].astype(int)
+    assert outside[2] > outside[0] and inside[0] > inside[2]
+
+
+def test_real_keyframe_is_evaluated_and_viewed(nuscenes_tiny: Path, tmp_path: Path) -> None:
+    config = tiny_config(tmp_path / "run", steps=2)
+    config.data.dataset, config.data.root = "nuscenes", str(nuscenes_tiny)
+    pretrain(config)
+    result = evaluate_rendering(config, run_of(config))
+    assert result["depth_rays"] > 1000 and result["semantic_rays"] > 1000
+    assert 0 < result["nearest_visible"]["depth_median_m"] < result["nearest_visible"]["depth_mean_m"] < 5
+    paths = view(config, run_of(config), columns=16)
+    assert [path.name for path in paths][-1] == "000000_bev.png" and len(paths) == 7
+
+
+def test_rendering_leaves_the_network_alone(config: PretrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evaluation neither updates running statistics nor builds a graph."""
+    seen: list[Any] = []
+    render = Pretrainer.render
+
+    def watched(self: Pretrainer, *arguments: Any, **options: Any) -> RenderedView:
+        rendered = render(self, *arguments, **options)
+        seen.append((self.training, rendered.depth_m.requires_grad))
+        return rendered
+
+    monkeypatch.setattr(Pretrainer, "render", watched)
+    evaluate_rendering(config, run_of(config), max_frames=1)
+    assert len(seen) == 4 and set(seen) == {(False, False)}
