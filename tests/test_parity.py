@@ -1,0 +1,51 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""One training step on the compiled kernels against the same step on the references, in float32."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from torch import Tensor
+
+from pred.config import build, config_parser
+from pred.data.batch import TrainingBatches
+from pred.pretrain import PretrainConfig, build_model
+
+
+def losses_and_gradients(
+    config: PretrainConfig, backend: str, monkeypatch: pytest.MonkeyPatch
+) -> tuple[dict[str, float], dict[str, Tensor]]:
+    """The first step of a run: same weights, masks, rays and random numbers for either backend."""
+    monkeypatch.setenv("PRED_BACKEND", backend)
+    model = build_model(config)
+    batch = TrainingBatches(config.data, config.point_range, config.train.seed, total_steps=1)[0]
+    output = model(batch)
+    output.loss.backward()
+    losses = {name: float(term) for name, term in output.terms.items()} | {"total": float(output.loss.detach())}
+    gradients = {name: p.grad for name, p in model.named_parameters() if p.grad is not None}
+    return losses, gradients
+
+
+def check(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    parser = config_parser("parity", "", PretrainConfig)
+    config = build(parser, PretrainConfig, parser.parse_args(arguments))
+    losses, gradients = losses_and_gradients(config, "native", monkeypatch)
+    expected_losses, expected_gradients = losses_and_gradients(config, "reference", monkeypatch)
+    assert set(losses) == {"semantic", "depth", "eikonal", "total"} and losses["semantic"] > 0
+    for name, expected in expected_losses.items():
+        assert losses[name] == pytest.approx(expected, rel=1e-4), name
+    assert gradients.keys() == expected_gradients.keys() and len(gradients) > 20
+    largest = max(float(gradient.norm()) for gradient in expected_gradients.values())
+    for name, expected in expected_gradients.items():
+        error = float((gradients[name] - expected).norm())
+        assert error <= 1e-3 * max(float(expected.norm()), 1e-3 * largest), name
+
+
+def test_step_on_the_street(native: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    check(["--config=demo", "--data.street.frames=1", "--data.workers=0"], monkeypatch)
+
+
+def test_step_on_the_real_keyframe(native: None, nuscenes_tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    check(["--config=nuscenes_tiny", f"--data.root={nuscenes_tiny}", "--data.workers=0"], monkeypatch)
