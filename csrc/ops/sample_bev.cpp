@@ -5,12 +5,14 @@
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
 
+#include <algorithm>
+#include <memory>
 #include <optional>
 #include <tuple>
-#include <vector>
 
 #include "common/check.h"
 #include "common/parallel.h"
+#include "common/radix_sort.h"
 
 namespace pred {
 namespace {
@@ -41,8 +43,6 @@ struct Inputs {
     check_cpu_tensor(op, "grid", grid_in, 3, bev_in.scalar_type());
     PRED_CHECK(grid_in.size(0) == batch && grid_in.size(2) == 2, op, ": grid must have shape [", batch, ", N, 2], got ",
                shape_text(grid_in));
-    PRED_CHECK(bev_in.size(2) < (int64_t(1) << 31) - 2 && grid_in.size(1) < (int64_t(1) << 31), op,
-               ": a map must have fewer than 2^31 rows and samples, got ", bev_in.size(2), " and ", grid_in.size(1));
     bev = torch::stable::contiguous(bev_in, MemoryFormat::ChannelsLast);
     grid = torch::stable::contiguous(grid_in);
     args = {bev.const_data_ptr<T>(),
@@ -99,30 +99,49 @@ Tensor new_channels_last(const Tensor& like) {
   return torch::stable::transpose(torch::stable::transpose(memory, 2, 3), 1, 2);
 }
 
-// Adds every sample's gradient to its cells, map row by map row.
+// Adds every sample's gradient to its cells; grad_grid, where not null, gets the samples' grid gradients on the way.
 template <typename T>
-Tensor scatter(const Inputs<T>& in, bool along_direction) {
+Tensor scatter(const Inputs<T>& in, bool along_direction, T* grad_grid) {
+  constexpr int64_t kBandRows = 8;
   const SampleBevArgs<T>& a = in.args;
   const auto& k = kernels<T>();
-  const int64_t num_keys = a.height + 2;
+  SampleBevOrder order{nullptr, bits_for(in.num_samples()), bits_for(a.width + 1), bits_for(a.height + 1)};
+  const int key_bits = bits_for(in.batch) + order.row_bits + order.column_bits;
+  PRED_CHECK(key_bits + order.number_bits < 64, "sample_bev: the maps have too many cells and samples to number");
+  const auto sorted = sort_rows<uint64_t>(
+      in.num_samples(), order.number_bits, key_bits,
+      [&](uint64_t* items, int64_t begin, int64_t end) { return k.pack(a, order, items, begin, end); });
+  order.items = sorted.items.get();
+
+  // First item whose lower corner lies in row `low` (from -1 on) of a map, or behind it.
+  const auto find = [&](int64_t map, int64_t low) {
+    const uint64_t key = (uint64_t(map) << order.row_bits) + uint64_t(low + 1);  // may carry: the next map
+    const uint64_t item = key << order.column_bits << order.number_bits;
+    return std::lower_bound(order.items, order.items + sorted.count, item) - order.items;
+  };
+  const int64_t num_bands = (a.height + kBandRows - 1) / kBandRows, row_size = a.width * a.channels;
   Tensor grad_bev = new_channels_last(in.bev);
-  std::vector<int32_t> key(in.num_samples()), order(in.num_samples());
-  std::vector<int64_t> row_begin(in.batch * num_keys + 1);
-  parallel(in.num_samples(), 8192, [&](int64_t begin, int64_t end) { k.row_keys(a, key.data(), begin, end); });
-  for (int64_t map = 0; map < in.batch; ++map) {  // counting sort
-    const int32_t* map_key = key.data() + map * a.num_samples;
-    int64_t* start = row_begin.data() + map * num_keys;
-    std::vector<int64_t> count(num_keys);
-    for (int64_t n = 0; n < a.num_samples; ++n) ++count[map_key[n]];
-    start[0] = map * a.num_samples;
-    for (int64_t j = 0; j < num_keys; ++j) start[j + 1] = start[j] + count[j];
-    std::vector<int64_t> next(start, start + num_keys);
-    for (int64_t n = 0; n < a.num_samples; ++n) order[next[map_key[n]]++] = int32_t(n);
-  }
-  const SampleBevRows rows{row_begin.data(), order.data()};
   T* out = const_cast<T*>(grad_bev.const_data_ptr<T>());
-  parallel(in.batch * a.height, 1,
-           [&](int64_t begin, int64_t end) { k.scatter_rows(a, rows, along_direction, out, begin, end); });
+  const std::unique_ptr<T[]> rows_before(new T[in.batch * num_bands * row_size]);
+  parallel(in.batch * num_bands, 1, [&](int64_t begin, int64_t end) {
+    for (int64_t task = begin; task < end; ++task) {
+      SampleBevBand<T> band{
+          task / num_bands, task % num_bands * kBandRows, 0, 0, 0, rows_before.get() + task * row_size};
+      band.end = std::min(band.begin + kBandRows, a.height);
+      band.first_item = find(band.map, band.begin - 1);
+      // The last row of a map is also the lower row of samples that hang over its edge.
+      band.last_item = find(band.map, band.end == a.height ? a.height : band.end - 1);
+      k.scatter_band(a, order, band, along_direction, out, grad_grid);
+    }
+  });
+  parallel(in.batch * num_bands, 1, [&](int64_t begin, int64_t end) {
+    for (int64_t task = begin; task < end; ++task) {
+      if (task % num_bands == 0) continue;
+      const T* from = rows_before.get() + task * row_size;
+      T* to = out + (task / num_bands * a.height + task % num_bands * kBandRows - 1) * row_size;
+      for (int64_t i = 0; i < row_size; ++i) to[i] += from[i];
+    }
+  });
   return grad_bev;
 }
 
@@ -145,11 +164,16 @@ std::tuple<Tensor, Tensor> sample_bev_backward(const Tensor& grad, const Tensor&
     Inputs<T> in(op, bev, grid, border, align_corners);
     in.set_grad(op, grad);
     const SampleBevArgs<T>& a = in.args;
-    Tensor grad_bev = need_bev ? scatter(in, false) : no_tensor(bev);
-    Tensor grad_grid = no_tensor(bev);
+    Tensor grad_bev = no_tensor(bev), grad_grid = no_tensor(bev);
+    T* data = nullptr;
     if (need_grid) {
       grad_grid = torch::stable::new_empty(grid, {in.batch, a.num_samples, 2});
-      T* data = grad_grid.mutable_data_ptr<T>();
+      data = grad_grid.mutable_data_ptr<T>();
+    }
+    if (need_bev) {
+      if (need_grid) torch::stable::zero_(grad_grid);  // samples that touch nothing are not visited
+      grad_bev = scatter(in, false, data);
+    } else if (need_grid) {
       parallel(in.num_samples(), sample_grain(a.channels),
                [&](int64_t begin, int64_t end) { kernels<T>().backward_grid(a, data, begin, end); });
     }
@@ -178,7 +202,7 @@ std::tuple<Tensor, Tensor, Tensor> sample_bev_double_backward(std::optional<Tens
                [&](int64_t begin, int64_t end) { kernels<T>().double_backward(a, grad_data, grid_data, begin, end); });
     }
     if (need_bev && a.grad_grad_grid) {
-      out_bev = scatter(in, true);
+      out_bev = scatter<T>(in, true, nullptr);
     } else if (need_bev) {  // the map enters only through the grid's gradient
       out_bev = new_channels_last(bev);
       torch::stable::zero_(out_bev);

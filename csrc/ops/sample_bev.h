@@ -31,21 +31,30 @@ struct SampleBevArgs {
   const T* grad_grad_grid;  // [B, N, 2] or null
 };
 
-// The samples of each map, stably sorted by the map row of their lower corner (key low + 1 in [0, H],
-// H + 1 for samples that touch nothing): row_begin[b * (H + 2) + key] indexes into order.
-struct SampleBevRows {
-  const int64_t* row_begin;  // [B * (H + 2) + 1]
-  const int32_t* order;      // [B * N] sample index within its map
+// Samples that touch their map, sorted by their lower corner's cell and, within it, by their number. Bits of an
+// item from the top: map, row + 1, column + 1, sample number b * N + n.
+struct SampleBevOrder {
+  const uint64_t* items;
+  int number_bits, column_bits, row_bits;
 };
 
-// Ranges count samples over all maps (b * N + n), or map rows over all maps (b * H + y).
+// Map rows that one task of the scatter owns, y in [begin, end), and the items whose lower corner lies in rows
+// [begin - 1, end - 1). Their share of row begin - 1, which the band before owns, goes to `row_before`.
+template <typename T>
+struct SampleBevBand {
+  int64_t map, begin, end;
+  int64_t first_item, last_item;
+  T* row_before;  // [W, C]
+};
+
+// Ranges count samples over all maps (b * N + n).
 template <typename T>
 struct SampleBevKernels {
   void (*forward)(const SampleBevArgs<T>&, T* out, int64_t begin, int64_t end);
-  void (*row_keys)(const SampleBevArgs<T>&, int32_t* key, int64_t begin, int64_t end);
-  // along_direction: use b_k in place of w_k.
-  void (*scatter_rows)(const SampleBevArgs<T>&, const SampleBevRows&, bool along_direction, T* grad_bev, int64_t begin,
-                       int64_t end);
+  int64_t (*pack)(const SampleBevArgs<T>&, const SampleBevOrder&, uint64_t* items, int64_t begin, int64_t end);
+  // along_direction: use b_k in place of w_k. grad_grid, where not null, gets the samples' grid gradients.
+  void (*scatter_band)(const SampleBevArgs<T>&, const SampleBevOrder&, const SampleBevBand<T>&, bool along_direction,
+                       T* grad_bev, T* grad_grid);
   void (*backward_grid)(const SampleBevArgs<T>&, T* grad_grid, int64_t begin, int64_t end);
   // Either output may be null.
   void (*double_backward)(const SampleBevArgs<T>&, T* grad_out, T* grad_grid, int64_t begin, int64_t end);

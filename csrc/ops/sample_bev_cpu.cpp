@@ -1,8 +1,8 @@
 // Copyright 2026 The PRED authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// One iteration owns one sample (gathers) or one map row (scatter): a map row is summed by one thread,
-// over its samples in a fixed order, so results do not depend on the number of threads.
+// One iteration owns one sample (gathers) or one band of map rows (scatter). A band adds up its samples in the
+// order of their cells, so results do not depend on the number of threads, and a cell's sums stay in cache.
 #include "ops/sample_bev.h"
 
 namespace pred::PRED_ISA {
@@ -11,7 +11,7 @@ namespace {
 template <typename T>
 struct Corners {
   const T* row[4];  // null outside the map
-  bool all;
+  bool all, any;
 };
 
 template <typename T>
@@ -20,10 +20,12 @@ static inline Corners<T> corners(const T* map, const BilinearStencil<T>& s, int6
                           s.y.high_inside && s.x.low_inside, s.y.high_inside && s.x.high_inside};
   Corners<T> c;
   c.all = true;
+  c.any = false;
   for (int k = 0; k < 4; ++k) {
     const int64_t y = s.y.low + (k >> 1), x = s.x.low + (k & 1);
     c.row[k] = inside[k] ? map + (y * width + x) * channels : nullptr;
     c.all = c.all && inside[k];
+    c.any = c.any || inside[k];
   }
   return c;
 }
@@ -89,45 +91,92 @@ static void forward(const SampleBevArgs<T>& a, T* out, int64_t begin, int64_t en
 }
 
 template <typename T>
-static void row_keys(const SampleBevArgs<T>& a, int32_t* key, int64_t begin, int64_t end) {
+static int64_t pack(const SampleBevArgs<T>& a, const SampleBevOrder& order, uint64_t* items, int64_t begin,
+                    int64_t end) {
+  int64_t count = 0;
   for (int64_t i = begin; i < end; ++i) {
     const auto s = bilinear_stencil(a.grid + 2 * i, a.height, a.width, a.border, a.align_corners);
-    const bool touches = (s.y.low_inside || s.y.high_inside) && (s.x.low_inside || s.x.high_inside);
-    key[i] = int32_t(touches ? s.y.low + 1 : a.height + 1);
+    if (!((s.y.low_inside || s.y.high_inside) && (s.x.low_inside || s.x.high_inside))) continue;
+    uint64_t item = uint64_t(i / a.num_samples);
+    item = item << order.row_bits | uint64_t(s.y.low + 1);
+    item = item << order.column_bits | uint64_t(s.x.low + 1);
+    items[count++] = item << order.number_bits | uint64_t(i);
+  }
+  return count;
+}
+
+// cell[c] += weight grad[c]; returns sum_c grad[c] corner[c] if kDot.
+template <bool kDot, typename T>
+static inline T add_to_cell(T weight, const T* __restrict grad, const T* __restrict corner, int64_t channels,
+                            T* __restrict cell) {
+  constexpr int64_t kLanes = 16;
+  T partial[kLanes] = {};
+  int64_t c = 0;
+  for (; c + kLanes <= channels; c += kLanes) {
+    for (int64_t lane = 0; lane < kLanes; ++lane) {
+      cell[c + lane] += weight * grad[c + lane];
+      if (kDot) partial[lane] += grad[c + lane] * corner[c + lane];
+    }
+  }
+  T dot = T(0);
+  for (; c < channels; ++c) {
+    cell[c] += weight * grad[c];
+    if (kDot) dot += grad[c] * corner[c];
+  }
+  if (kDot) {
+    for (int64_t half = kLanes / 2; half > 0; half /= 2) {
+      for (int64_t lane = 0; lane < half; ++lane) partial[lane] += partial[lane + half];
+    }
+  }
+  return dot + partial[0];
+}
+
+template <bool kDot, typename T>
+static void scatter_band_items(const SampleBevArgs<T>& a, const SampleBevOrder& order, const SampleBevBand<T>& band,
+                               bool along_direction, T* grad_bev, T* grad_grid) {
+  constexpr int64_t kAhead = 4, kLineBytes = 64;
+  const int64_t row_size = a.width * a.channels;
+  const int64_t map_offset = band.map * a.height * row_size;
+  const uint64_t number_mask = (uint64_t(1) << order.number_bits) - 1;
+  T* map_rows = grad_bev + map_offset;
+  for (int64_t i = band.begin * row_size; i < band.end * row_size; ++i) map_rows[i] = T(0);
+  for (int64_t i = 0; i < row_size; ++i) band.row_before[i] = T(0);
+  for (int64_t j = band.first_item; j < band.last_item; ++j) {
+    if (j + kAhead < band.last_item) {  // rows of `grad` are visited in the order of cells, not of memory
+      const T* next = a.grad + int64_t(order.items[j + kAhead] & number_mask) * a.channels;
+      for (int64_t c = 0; c < a.channels; c += kLineBytes / int64_t(sizeof(T))) __builtin_prefetch(next + c);
+    }
+    const int64_t i = int64_t(order.items[j] & number_mask);
+    const auto s = bilinear_stencil(a.grid + 2 * i, a.height, a.width, a.border, a.align_corners);
+    T weight[4], dots[4] = {};
+    if (along_direction) {
+      bilinear_directional(s, a.grad_grad_grid + 2 * i, weight);
+    } else {
+      bilinear_weights(s, weight);
+    }
+    for (int k = 0; k < 4; ++k) {
+      if (!((k >> 1 ? s.y.high_inside : s.y.low_inside) && (k & 1 ? s.x.high_inside : s.x.low_inside))) continue;
+      const int64_t y = s.y.low + (k >> 1), cell = (s.x.low + (k & 1)) * a.channels;
+      T* row = y < band.begin ? band.row_before : map_rows + y * row_size;
+      dots[k] = add_to_cell<kDot>(weight[k], a.grad + i * a.channels, a.bev + map_offset + y * row_size + cell,
+                                  a.channels, row + cell);
+    }
+    if (kDot) {
+      T gradient[2];
+      bilinear_gradient(s, dots, gradient);
+      grad_grid[2 * i] = gradient[0] * s.x.scale;
+      grad_grid[2 * i + 1] = gradient[1] * s.y.scale;
+    }
   }
 }
 
 template <typename T>
-static void scatter_rows(const SampleBevArgs<T>& a, const SampleBevRows& rows, bool along_direction, T* grad_bev,
-                         int64_t begin, int64_t end) {
-  const int64_t row_size = a.width * a.channels;
-  for (int64_t row = begin; row < end; ++row) {
-    const int64_t map = row / a.height, y = row % a.height;
-    T* out = grad_bev + row * row_size;
-    for (int64_t i = 0; i < row_size; ++i) out[i] = T(0);
-    const int64_t* row_begin = rows.row_begin + map * (a.height + 2);
-    // Samples with low == y - 1 reach this row with their upper corners (k = 2, 3), those with
-    // low == y with their lower ones (k = 0, 1).
-    for (int upper = 1; upper >= 0; --upper) {
-      const int64_t key = y + 1 - upper;
-      for (int64_t j = row_begin[key]; j < row_begin[key + 1]; ++j) {
-        const int64_t i = map * a.num_samples + rows.order[j];
-        const auto s = bilinear_stencil(a.grid + 2 * i, a.height, a.width, a.border, a.align_corners);
-        T weight[4];
-        if (along_direction) {
-          bilinear_directional(s, a.grad_grad_grid + 2 * i, weight);
-        } else {
-          bilinear_weights(s, weight);
-        }
-        const T* __restrict grad = a.grad + i * a.channels;
-        for (int right = 0; right < 2; ++right) {
-          if (!(right ? s.x.high_inside : s.x.low_inside)) continue;
-          const T w = weight[2 * upper + right];
-          T* __restrict cell = out + (s.x.low + right) * a.channels;
-          for (int64_t c = 0; c < a.channels; ++c) cell[c] += w * grad[c];
-        }
-      }
-    }
+static void scatter_band(const SampleBevArgs<T>& a, const SampleBevOrder& order, const SampleBevBand<T>& band,
+                         bool along_direction, T* grad_bev, T* grad_grid) {
+  if (grad_grid) {
+    scatter_band_items<true>(a, order, band, along_direction, grad_bev, grad_grid);
+  } else {
+    scatter_band_items<false>(a, order, band, along_direction, grad_bev, grad_grid);
   }
 }
 
@@ -137,9 +186,12 @@ static void backward_grid(const SampleBevArgs<T>& a, T* grad_grid, int64_t begin
   for (int64_t i = begin; i < end; ++i) {
     const auto s = bilinear_stencil(a.grid + 2 * i, a.height, a.width, a.border, a.align_corners);
     const T* map = a.bev + i / a.num_samples * map_size;
-    T dots[4], gradient[2];
-    corner_dots(corners(map, s, a.width, a.channels), a.grad + i * a.channels, a.channels, dots);
-    bilinear_gradient(s, dots, gradient);
+    const auto p = corners(map, s, a.width, a.channels);
+    T dots[4], gradient[2] = {T(0), T(0)};
+    if (p.any) {
+      corner_dots(p, a.grad + i * a.channels, a.channels, dots);
+      bilinear_gradient(s, dots, gradient);
+    }
     grad_grid[2 * i] = gradient[0] * s.x.scale;
     grad_grid[2 * i + 1] = gradient[1] * s.y.scale;
   }
@@ -168,11 +220,11 @@ static void double_backward(const SampleBevArgs<T>& a, T* grad_out, T* grad_grid
     if (grad_grid) {
       const T* grad = a.grad + i * a.channels;
       T dots[4], gradient[2] = {T(0), T(0)};
-      if (a.grad_grad_bev) {
+      if (p.any && a.grad_grad_bev) {
         corner_dots(u, grad, a.channels, dots);
         bilinear_gradient(s, dots, gradient);
       }
-      if (a.grad_grad_grid) {
+      if (p.any && a.grad_grad_grid) {
         corner_dots(p, grad, a.channels, dots);
         const T mixed = dots[0] - dots[1] - dots[2] + dots[3];
         gradient[0] += mixed * direction[1] * s.y.scale;
@@ -186,9 +238,9 @@ static void double_backward(const SampleBevArgs<T>& a, T* grad_out, T* grad_grid
 
 }  // namespace
 
-const SampleBevKernels<float> sample_bev_f32 = {forward<float>, row_keys<float>, scatter_rows<float>,
-                                                backward_grid<float>, double_backward<float>};
-const SampleBevKernels<double> sample_bev_f64 = {forward<double>, row_keys<double>, scatter_rows<double>,
+const SampleBevKernels<float> sample_bev_f32 = {forward<float>, pack<float>, scatter_band<float>, backward_grid<float>,
+                                                double_backward<float>};
+const SampleBevKernels<double> sample_bev_f64 = {forward<double>, pack<double>, scatter_band<double>,
                                                  backward_grid<double>, double_backward<double>};
 
 }  // namespace pred::PRED_ISA
