@@ -1,0 +1,291 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from pred.ops import composite_rays, reference
+from tests.tolerances import FORWARD, GRADIENT, assert_close
+
+OUTPUTS = ("weights", "depth", "opacity", "values")
+INPUTS = ("sdf", "inv_s", "t", "values")
+
+
+def case(
+    num_rays: int = 5, samples: int = 33, channels: int = 4, dtype: torch.dtype = torch.float64
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rays through soft and sharp surfaces, some of which they leave again."""
+    generator = torch.Generator().manual_seed(1000 * num_rays + 10 * samples + channels)
+    t = (torch.rand(num_rays, samples, generator=generator, dtype=torch.float64).cumsum(dim=1) + 1).to(dtype)
+    wiggle = torch.randn(num_rays, samples, generator=generator, dtype=torch.float64)
+    surface = torch.linspace(2, 12, num_rays, dtype=torch.float64)[:, None]
+    sdf = (surface - t.double() * 0.8 + 0.4 * wiggle).to(dtype)
+    values = torch.randn(num_rays, samples, channels, generator=generator, dtype=torch.float64).to(dtype)
+    return sdf, torch.tensor(2.7, dtype=dtype), t, values
+
+
+def results(
+    function: Any, inputs: tuple[Tensor, ...], outputs: tuple[str, ...] = OUTPUTS, **options: Any
+) -> dict[str, Tensor]:
+    """Outputs, and derivatives of a sum of the named outputs with fixed random cotangents."""
+    leaves = [tensor.detach().clone().requires_grad_() for tensor in inputs]
+    out = function(*leaves, **options)
+    found = {name: getattr(out, name) for name in OUTPUTS}
+    generator = torch.Generator().manual_seed(7)
+    total = leaves[0].new_zeros(())
+    for name in outputs:
+        cotangent = torch.randn(found[name].shape, generator=generator, dtype=torch.float64)
+        total = total + (found[name] * cotangent.to(found[name].dtype)).sum()
+    grads = torch.autograd.grad(total, leaves, allow_unused=True)
+    zero = {f"grad_{name}": torch.zeros_like(leaf) for name, leaf in zip(INPUTS, leaves, strict=True)}
+    found |= {key: value if grad is None else grad for (key, value), grad in zip(zero.items(), grads, strict=True)}
+    return {name: value.detach() for name, value in found.items()}
+
+
+def test_hand_computed(backend: str) -> None:
+    # s = 1: Phi = 0.7310586, 0.5, 0.2689414. Weights telescope: w_0 = w_1 = 0.2310586 / 0.7310586, and 1 / e is left.
+    sdf = torch.tensor([[1.0, 0.0, -1.0]], dtype=torch.float64, requires_grad=True)
+    t = torch.tensor([[2.0, 4.0, 8.0]], dtype=torch.float64, requires_grad=True)
+    values = torch.eye(3, dtype=torch.float64)[None]
+    w, rest = 0.23105857863 / 0.73105857863, math.exp(-1)
+    out = composite_rays(sdf, 1.0, t, values)
+    assert out.weights[0].tolist() == pytest.approx([w, w, 0.0], abs=1e-10)
+    assert out.opacity.item() == pytest.approx(1 - rest)
+    assert out.depth.item() == pytest.approx(6 * w)
+    assert out.values is not None and out.values[0].tolist() == pytest.approx([w, w, 0.0], abs=1e-10)
+    # opacity = 1 - Phi(d_2) / Phi(d_0), whose derivatives are those of Phi.
+    grads = torch.autograd.grad(out.opacity, sdf)[0][0].tolist()
+    assert grads == pytest.approx([0.26894142 * 0.19661193 / 0.53444665, 0.0, -0.19661193 / 0.73105858], abs=1e-7)
+    (grad_t,) = torch.autograd.grad(composite_rays(sdf, 1.0, t).depth, t)
+    assert grad_t[0].tolist() == pytest.approx([w, w, 0.0], abs=1e-10)
+    # The middles of the sections are 3 and 6.
+    assert composite_rays(sdf, 1.0, t, depth_at="mid").depth.item() == pytest.approx(9 * w)
+    assert composite_rays(sdf, 1.0, t, normalize_depth=True).depth.item() == pytest.approx(3.0)
+    opaque = composite_rays(sdf, 1.0, t, values, last="opaque")
+    assert opaque.weights[0].tolist() == pytest.approx([w, w, rest])
+    assert opaque.opacity.item() == pytest.approx(1.0)
+    assert opaque.depth.item() == pytest.approx(6 * w + 8 * rest)
+    assert composite_rays(sdf, 1.0, t, depth_at="mid", last="opaque").depth.item() == pytest.approx(9 * w + 8 * rest)
+
+
+def test_opaque_sample_has_the_right_gradient(backend: str) -> None:
+    """alpha = 1 exactly in the middle of a ray: a division by 1 - alpha would be wrong or NaN there.
+
+    With the section between samples 1 and 2 opaque, values behind it do not count, and d C / d alpha_0 = c_0 - c_1.
+    """
+    sdf = torch.tensor([[0.5, 0.2, -50.0, -51.0]], dtype=torch.float64, requires_grad=True)
+    t = torch.tensor([[1.0, 2.0, 3.0, 4.0]], dtype=torch.float64)
+    values = torch.tensor([[[1.0], [2.0], [3.0], [4.0]]], dtype=torch.float64)
+    out = composite_rays(sdf, 20.0, t, values)
+    alpha_0 = 1 - (1 + math.exp(-10)) / (1 + math.exp(-4))
+    assert out.weights[0].tolist() == pytest.approx([alpha_0, 1 - alpha_0, 0.0, 0.0], abs=1e-12)
+    assert out.values is not None
+    (grad,) = torch.autograd.grad(out.values.sum(), sdf)
+    # C = 2 - alpha_0; alpha_0 = 1 - Phi(d_1) / Phi(d_0) with Phi' = 20 Phi (1 - Phi).
+    ratio, rest_0, rest_1 = 1 - alpha_0, 1 - 1 / (1 + math.exp(-10)), 1 - 1 / (1 + math.exp(-4))
+    assert grad[0].tolist() == pytest.approx([-20 * ratio * rest_0, 20 * ratio * rest_1, 0.0, 0.0], abs=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("sharp", [500.0, -500.0])
+def test_sharp_surfaces_stay_finite(backend: str, sharp: float, dtype: torch.dtype) -> None:
+    """s d = +-500, rising, falling, crossing: finite values and gradients."""
+    rows = [[1.0, 0.5, 0.2, 0.1], [-1.0, -0.5, 0.5, 1.0], [1.0, -1.0, 1.0, -1.0], [-0.2, -0.5, -0.7, -1.0]]
+    sdf = torch.tensor(rows, dtype=dtype) * (1 if sharp > 0 else -1)
+    inputs = (sdf, torch.tensor(abs(sharp), dtype=dtype), torch.arange(1.0, 5.0, dtype=dtype).expand(4, -1))
+    found = results(composite_rays, (*inputs, torch.ones(4, 4, 2, dtype=dtype)))
+    assert all(value.isfinite().all() for value in found.values())
+    assert (found["weights"] >= 0).all() and (found["opacity"] <= 1 + 1e-6).all()
+
+
+def test_free_space_is_empty(backend: str) -> None:
+    """223 samples of s d >> 1 add up to nothing: no phantom opacity that fogs the depth behind it."""
+    sdf = torch.linspace(30, 2, 224)[None]
+    out = composite_rays(sdf, 64.0, torch.linspace(1, 50, 224)[None])
+    assert out.opacity.item() < 1e-30 and out.depth.item() < 1e-28
+
+
+def test_transmittance_underflow(backend: str) -> None:
+    """Hundreds of half-opaque samples: weights vanish, nothing becomes NaN, and they add up to 1."""
+    sdf = -torch.arange(400.0)[None] * 0.02
+    sdf.requires_grad_()
+    out = composite_rays(sdf, 64.0, torch.linspace(1, 50, 400)[None])
+    assert out.opacity.item() == pytest.approx(1.0, abs=1e-6)
+    out.depth.sum().backward()
+    assert sdf.grad is not None and sdf.grad.isfinite().all()
+
+
+SHAPES = [(1, 1, 1), (2, 2, 3), (3, 15, 19), (3, 16, 1), (3, 17, 16), (5, 33, 17), (4, 224, 19), (2, 257, 32)]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+    "options", [{}, {"depth_at": "mid", "last": "opaque", "normalize_depth": True}], ids=["default", "mid"]
+)
+def test_native_equals_reference(
+    native: None, shape: tuple[int, int, int], dtype: torch.dtype, options: dict[str, Any]
+) -> None:
+    inputs = case(*shape, dtype=dtype)
+    actual = results(composite_rays, inputs, **options)
+    wide = tuple(tensor.double() for tensor in inputs)
+    expected = results(reference.composite_rays, wide, **options)
+    for name, value in actual.items():
+        assert value.dtype == dtype
+        tolerance = (GRADIENT if name.startswith("grad") else FORWARD)[dtype]
+        assert_close(value.double(), expected[name], tolerance, name)
+
+
+@pytest.mark.parametrize(
+    "outputs", [("weights",), ("depth",), ("opacity",), ("values",), ("depth", "values")], ids="+".join
+)
+def test_each_output_has_its_gradient(native: None, outputs: tuple[str, ...]) -> None:
+    inputs = case()
+    actual = results(composite_rays, inputs, outputs)
+    expected = results(reference.composite_rays, inputs, outputs)
+    for name, value in actual.items():
+        assert_close(value, expected[name], GRADIENT[torch.float64], name)
+
+
+def test_without_values(native: None) -> None:
+    sdf, inv_s, t, _ = case()
+    out, expected = composite_rays(sdf, inv_s, t), reference.composite_rays(sdf, inv_s, t)
+    assert out.values is None and expected.values is None
+    for actual, wanted in zip(out[:3], expected[:3], strict=True):
+        assert_close(actual, wanted, FORWARD[torch.float64])
+
+
+def test_levels_agree(level: str) -> None:
+    inputs = case(9, 224, 19, torch.float32)
+    actual = results(composite_rays, inputs)
+    expected = results(reference.composite_rays, tuple(tensor.double() for tensor in inputs))
+    for name, value in actual.items():
+        assert_close(value.double(), expected[name], 1e-5, name)
+
+
+@pytest.mark.parametrize("last", ["zero", "opaque"])
+@pytest.mark.parametrize("depth_at", ["start", "mid"])
+def test_gradcheck(backend: str, last: str, depth_at: str) -> None:
+    inputs = tuple(tensor.requires_grad_() for tensor in case(2, 6, 2))
+    assert torch.autograd.gradcheck(lambda *x: tuple(composite_rays(*x, last=last, depth_at=depth_at)), inputs)
+
+
+def test_detached_distance(backend: str) -> None:
+    sdf, inv_s, t, values = (tensor.requires_grad_() for tensor in case())
+    out = composite_rays(sdf, inv_s, t, values, detach_sdf=True)
+    assert out.values is not None
+    total = out.values.sum() + out.depth.sum()
+    grads = torch.autograd.grad(total, (sdf, inv_s, t, values), allow_unused=True)
+    assert grads[0] is None and grads[1] is None
+    assert grads[2] is not None and grads[3] is not None
+    full = composite_rays(sdf, inv_s, t, values)
+    assert full.values is not None
+    expected = torch.autograd.grad(full.values.sum() + full.depth.sum(), (t, values))
+    assert_close(grads[2], expected[0], 1e-14)
+    assert_close(grads[3], expected[1], 1e-14)
+    kept = composite_rays(sdf, inv_s, t, detach_sdf=True, detach_inv_s=False)
+    of_sdf, of_inv_s = torch.autograd.grad(kept.depth.sum(), (sdf, inv_s), allow_unused=True)
+    assert of_sdf is None and of_inv_s is not None and of_inv_s != 0
+
+
+@pytest.mark.parametrize("num_rays", [0, 3])
+def test_opcheck(native: None, num_rays: int) -> None:
+    sdf, inv_s, t, values = (tensor.float().requires_grad_() for tensor in case(num_rays, 9, 3))
+    torch.library.opcheck(torch.ops.pred.composite_rays.default, (sdf, inv_s, t, values, False, False))
+    torch.library.opcheck(torch.ops.pred.composite_rays.default, (sdf, inv_s, t, None, True, True))
+    plain = [tensor.detach() for tensor in (sdf, inv_s, t, values)]
+    grads = [torch.randn(num_rays, 9), torch.randn(num_rays), torch.randn(num_rays), torch.randn(num_rays, 3)]
+    torch.library.opcheck(
+        torch.ops.pred.composite_rays_backward.default, (*grads, *plain, None, False, False, True, True, True, True)
+    )
+
+
+def test_further_derivative_is_refused(native: None) -> None:
+    sdf, inv_s, t, values = case()
+    sdf.requires_grad_()
+    (first,) = torch.autograd.grad(composite_rays(sdf, inv_s, t).depth.sum(), sdf, create_graph=True)
+    with pytest.raises(RuntimeError, match="composite_rays_backward: a further derivative"):
+        first.square().sum().backward()
+
+
+def test_compiles_to_one_graph(backend: str) -> None:
+    inputs = tuple(tensor.requires_grad_() for tensor in case())
+
+    def loss(*x: Tensor) -> Tensor:
+        out = composite_rays(*x)
+        assert out.values is not None
+        return out.depth.sum() + out.values.square().sum()
+
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    for actual, expected in zip(
+        torch.autograd.grad(compiled(*inputs), inputs), torch.autograd.grad(loss(*inputs), inputs), strict=True
+    ):
+        assert_close(actual, expected, 1e-12)
+
+
+def test_bitwise_equal_for_any_thread_count(native: None) -> None:
+    inputs = case(300, 224, 19, torch.float32)
+    found = []
+    for threads in (1, 2, 7):
+        torch.set_num_threads(threads)
+        found.append(results(composite_rays, inputs))
+    for other in found[1:]:
+        assert all(torch.equal(value, other[name]) for name, value in found[0].items())
+
+
+@pytest.mark.parametrize("which", ["sdf", "t", "values"])
+def test_nan_stays_in_its_ray(backend: str, which: str) -> None:
+    inputs = case(4, 40, 3, torch.float32)
+    clean = results(composite_rays, inputs)
+    dirty = tuple(tensor.clone() for tensor in inputs)
+    dirty[INPUTS.index(which)][1, 11] = torch.nan
+    found = results(composite_rays, dirty)
+    others = [0, 2, 3]
+    for name, value in found.items():
+        if name != "grad_inv_s":  # shared by all rays
+            assert torch.equal(value[others], clean[name][others]), name
+    assert any(value[1].isnan().any() for name, value in found.items() if name != "grad_inv_s")
+
+
+def test_layouts_agree(backend: str) -> None:
+    sdf, inv_s, t, values = case()
+    expected = composite_rays(sdf, inv_s, t, values)
+    strided = values.permute(2, 0, 1).contiguous().permute(1, 2, 0)
+    for out in (
+        composite_rays(sdf[..., None], inv_s.reshape(1), t[..., None], values),
+        composite_rays(sdf.T.contiguous().T, 2.7, t, strided),
+    ):
+        for actual, wanted in zip(out, expected, strict=True):
+            assert actual is not None and wanted is not None
+            assert_close(actual, wanted, 1e-15)
+
+
+def test_errors(backend: str) -> None:
+    sdf, inv_s, t, values = case()
+    with pytest.raises(ValueError, match=r"composite_rays: t must have shape \[5, 33\] .*got \[5, 32\]"):
+        composite_rays(sdf, inv_s, t[:, 1:])
+    with pytest.raises(ValueError, match=r"composite_rays: values must have shape \[5, 33, C\], got \[4, 33, 4\]"):
+        composite_rays(sdf, inv_s, t, values[1:])
+    with pytest.raises(TypeError, match="composite_rays: t must have the dtype of sdf"):
+        composite_rays(sdf, inv_s, t.float())
+    with pytest.raises(ValueError, match="composite_rays: depth_at must be one of start, mid"):
+        composite_rays(sdf, inv_s, t, depth_at="end")
+    with pytest.raises(ValueError, match=r"composite_rays: inv_s must have one element, got shape \[2\]"):
+        composite_rays(sdf, torch.ones(2, dtype=torch.float64), t)
+    with pytest.raises(ValueError, match="composite_rays: inv_s must be above 0"):
+        composite_rays(sdf, 0.0, t)
+
+
+def test_autocast_computes_in_float32(backend: str) -> None:
+    sdf, _, t, values = case(dtype=torch.float32)
+    with torch.autocast("cpu", torch.bfloat16):
+        out = composite_rays(sdf, 2.7, t, values.bfloat16())
+    assert out.values is not None and out.values.dtype == torch.float32
+    expected = composite_rays(sdf, 2.7, t, values.bfloat16().float())
+    assert expected.values is not None
+    assert_close(out.values, expected.values, 1e-6)

@@ -1,0 +1,155 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from pred.ops import reference, resample_rays
+from tests.tolerances import assert_close
+
+
+def case(num_rays: int = 6, samples: int = 24, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    """Rays with most of their weight in a few sections."""
+    generator = torch.Generator().manual_seed(100 * num_rays + samples)
+    t = 1 + torch.rand(num_rays, samples, generator=generator, dtype=torch.float64).cumsum(dim=1)
+    weights = torch.rand(num_rays, samples, generator=generator, dtype=torch.float64) ** 6
+    return t.to(dtype), weights.to(dtype)
+
+
+def test_hand_computed(backend: str) -> None:
+    # Sections [0, 1], [1, 3], [3, 4] with probabilities 1/4, 1/2, 1/4; cdf 0, 0.25, 0.75, 1; the last
+    # weight is ignored.
+    t = torch.tensor([[0.0, 1.0, 3.0, 4.0]], dtype=torch.float64)
+    weights = torch.tensor([[1.0, 2.0, 1.0, 99.0]], dtype=torch.float64)
+    # u = 1/8, 3/8, 5/8, 7/8: middle of the first, a quarter and three quarters of the second, middle of the last.
+    out = resample_rays(t, weights, 4)
+    assert out[0].tolist() == [0.0, 0.5, 1.0, 1.5, 2.5, 3.0, 3.5, 4.0]
+    assert torch.equal(resample_rays(t, weights[:, :3], 4), out)
+    u = torch.tensor([0.0, 0.25, 0.5], dtype=torch.float64)
+    assert resample_rays(t, weights, 3, u)[0].tolist() == [0.0, 0.0, 1.0, 1.0, 2.0, 3.0, 4.0]
+    assert torch.equal(resample_rays(t, weights, 3, u[None]), resample_rays(t, weights, 3, u))
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf"), 1e-45])
+def test_useless_weights_are_uniform(backend: str, bad: float) -> None:
+    t = torch.tensor([[2.0, 3.0, 10.0]])
+    weights = torch.full((1, 2), bad)
+    out = resample_rays(t, weights, 4)  # (k + 1/2) / 4 of the way from 2 to 10
+    assert out[0].tolist() == pytest.approx([2.0, 3.0, 3.0, 5.0, 7.0, 9.0, 10.0])
+
+
+def test_negative_weights_count_as_zero(backend: str) -> None:
+    t = torch.tensor([[0.0, 1.0, 2.0, 3.0]])
+    out = resample_rays(t, torch.tensor([[-5.0, 1.0, 0.0]]), 2)
+    assert out[0].tolist() == pytest.approx([0.0, 1.0, 1.25, 1.75, 2.0, 3.0])
+
+
+def test_all_weight_in_the_last_section(backend: str) -> None:
+    """The cdf ends at 1 exactly, so that u just below 1 stays on the ray."""
+    t = torch.linspace(1, 5, 9)[None]
+    weights = torch.zeros(1, 8)
+    weights[0, -1] = 0.3
+    u = torch.tensor([0.0, 0.5, 1 - 2**-24])
+    out = resample_rays(t, weights, 3, u)
+    assert out.max() <= 5 and (out[0, 8:] >= 4.5).all()
+
+
+def test_duplicate_and_degenerate_positions(backend: str) -> None:
+    t = torch.tensor([[1.0, 1.0, 2.0, 2.0], [3.0, 3.0, 3.0, 3.0]])
+    out = resample_rays(t, torch.ones(2, 4), 5)
+    assert out.isfinite().all() and (out.diff(dim=1) >= 0).all()
+    assert (out[1] == 3).all() and out[0].min() == 1 and out[0].max() == 2
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    "shape", [(1, 2, 1), (3, 15, 16), (3, 16, 17), (5, 17, 15), (7, 96, 128), (4, 33, 0), (64, 48, 7)]
+)
+@pytest.mark.parametrize("given", [False, True])
+def test_native_equals_reference(native: None, shape: tuple[int, int, int], dtype: torch.dtype, given: bool) -> None:
+    num_rays, samples, new = shape
+    t, weights = case(num_rays, samples, dtype)
+    u = torch.rand(num_rays, new, generator=torch.Generator().manual_seed(3), dtype=dtype).sort(dim=1).values
+    actual = resample_rays(t, weights, new, u if given else None)
+    expected = reference.resample_rays(t.double(), weights.double(), new, u.double() if given else None)
+    assert actual.shape == (num_rays, samples + new) and actual.dtype == dtype
+    # Where the cdf is flat, a rounding of u or cdf moves a sample along the section: as far as 1e-7 / weight.
+    assert_close(actual.double(), expected, 2e-5 if dtype == torch.float32 else 1e-11)
+
+
+def test_levels_agree(level: str) -> None:
+    t, weights = case(33, 96, torch.float64)
+    assert_close(resample_rays(t, weights, 128), reference.resample_rays(t, weights, 128), 1e-11)
+
+
+def test_result_is_sorted_and_keeps_the_old_samples(backend: str) -> None:
+    t, weights = case(20, 96, torch.float32)
+    out = resample_rays(t, weights, 128)
+    assert (out.diff(dim=1) >= 0).all()
+    for ray in range(20):
+        assert torch.isin(t[ray], out[ray]).all()
+
+
+@pytest.mark.parametrize("which", ["t", "weights", "u"])
+def test_nan_stays_in_its_ray(backend: str, which: str) -> None:
+    t, weights = case(4, 24, torch.float32)
+    u = torch.rand(4, 9, generator=torch.Generator().manual_seed(0)).sort(dim=1).values
+    clean = resample_rays(t, weights, 9, u)
+    {"t": t, "weights": weights, "u": u}[which][1, 5] = torch.nan
+    out = resample_rays(t, weights, 9, u)
+    assert torch.equal(out[[0, 2, 3]], clean[[0, 2, 3]])
+    assert out.shape == clean.shape
+
+
+def test_unsorted_and_outlying_u_touch_no_foreign_memory(backend: str) -> None:
+    t, weights = case(3, 10, torch.float32)
+    u = torch.tensor([0.9, 0.1, 5.0, -3.0, float("inf"), 0.5])
+    out = resample_rays(t, weights, 6, u)
+    assert (out.diff(dim=1) >= 0).all()
+    assert (out >= t[:, :1]).all() and (out <= t[:, -1:]).all()
+
+
+def test_carries_no_gradient(backend: str) -> None:
+    t, weights = (tensor.requires_grad_() for tensor in case())
+    assert not resample_rays(t, weights, 5).requires_grad
+
+
+@pytest.mark.parametrize("num_rays", [0, 3])
+def test_opcheck(native: None, num_rays: int) -> None:
+    t, weights = case(num_rays, 10, torch.float32)
+    u = (torch.arange(5) + 0.5) / 5
+    torch.library.opcheck(torch.ops.pred.resample_rays.default, (t, weights, u))
+    assert resample_rays(t, weights, 5).shape == (num_rays, 15)
+
+
+def test_compiles_to_one_graph(backend: str) -> None:
+    t, weights = case()
+    compiled = torch.compile(lambda a, b: resample_rays(a, b, 7), fullgraph=True, backend="aot_eager")
+    assert_close(compiled(t, weights), resample_rays(t, weights, 7), 1e-13)
+
+
+def test_bitwise_equal_for_any_thread_count(native: None) -> None:
+    t, weights = case(500, 96, torch.float32)
+    found = []
+    for threads in (1, 2, 7):
+        torch.set_num_threads(threads)
+        found.append(resample_rays(t, weights, 128))
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
+
+
+def test_errors(backend: str) -> None:
+    t, weights = case()
+    with pytest.raises(
+        ValueError, match=r"resample_rays: weights must have shape \[6, 24\] or \[6, 23\], got \[6, 22\]"
+    ):
+        resample_rays(t, weights[:, 2:], 4)
+    with pytest.raises(ValueError, match="resample_rays: t must have at least 2 samples per ray, got 1"):
+        resample_rays(t[:, :1], weights[:, :1], 4)
+    with pytest.raises(ValueError, match="resample_rays: num_samples must be 0 or more, got -1"):
+        resample_rays(t, weights, -1)
+    with pytest.raises(TypeError, match="resample_rays: weights must have the dtype of t"):
+        resample_rays(t, weights.float(), 4)
+    with pytest.raises(ValueError, match=r"resample_rays: u must have shape \[6, 4\] or \[4\], got \[3\]"):
+        resample_rays(t, weights, 4, torch.zeros(3, dtype=t.dtype))
