@@ -46,29 +46,24 @@ struct ExpConstants<double> {
   static constexpr int mantissa_bits = 52;
 };
 
-// exp(f) - 1 for |f| <= log(2) / 2: the Taylor series, cut off below half a unit in the last place.
+// exp(f) - 1 for |f| <= log(2) / 2: the Taylor series, cut off below half a unit in the last place. Its terms are
+// paired, and the pairs summed in f^2, to shorten the chain of dependent operations.
 template <typename V>
 PRED_HOST_DEVICE V expm1_reduced(V f) {
+  const V f2 = f * f;
   if constexpr (sizeof(typename Lane<V>::Scalar) == 4) {
-    V p = f * (1.0f / 5040) + 1.0f / 720;
-    p = p * f + 1.0f / 120;
-    p = p * f + 1.0f / 24;
-    p = p * f + 1.0f / 6;
-    p = p * f + 0.5f;
-    return p * f * f + f;
+    const V p0 = f * (1.0f / 6) + 0.5f;
+    const V p1 = f * (1.0f / 120) + 1.0f / 24;
+    const V p2 = f * (1.0f / 5040) + 1.0f / 720;
+    return ((p2 * f2 + p1) * f2 + p0) * f2 + f;
   } else {
-    V p = f * (1.0 / 6227020800) + 1.0 / 479001600;
-    p = p * f + 1.0 / 39916800;
-    p = p * f + 1.0 / 3628800;
-    p = p * f + 1.0 / 362880;
-    p = p * f + 1.0 / 40320;
-    p = p * f + 1.0 / 5040;
-    p = p * f + 1.0 / 720;
-    p = p * f + 1.0 / 120;
-    p = p * f + 1.0 / 24;
-    p = p * f + 1.0 / 6;
-    p = p * f + 0.5;
-    return p * f * f + f;
+    const V p0 = f * (1.0 / 6) + 0.5;
+    const V p1 = f * (1.0 / 120) + 1.0 / 24;
+    const V p2 = f * (1.0 / 5040) + 1.0 / 720;
+    const V p3 = f * (1.0 / 362880) + 1.0 / 40320;
+    const V p4 = f * (1.0 / 39916800) + 1.0 / 3628800;
+    const V p5 = f * (1.0 / 6227020800) + 1.0 / 479001600;
+    return (((((p5 * f2 + p4) * f2 + p3) * f2 + p2) * f2 + p1) * f2 + p0) * f2 + f;
   }
 }
 

@@ -127,6 +127,36 @@ inline __attribute__((always_inline)) Vec<T, N> suffix_sum(Vec<T, N> v) {
   else return v;
 }
 
+// Copies past the caches, for results too large to stay there: saves reading the destination. Whole lines only; the
+// ends of the row are stored as usual. fence_stream() must follow before another thread may read.
+template <typename T>
+inline void stream_row(const T* __restrict from, T* __restrict to, int64_t n) {
+  int64_t i = 0;
+#if defined(__SSE2__)
+  constexpr int64_t line = 64 / int64_t(sizeof(T));
+  for (; i < n && (uintptr_t)(to + i) % 64 != 0; ++i) to[i] = from[i];
+  for (; i + line <= n; i += line) {
+    for (int64_t k = 0; k < line; k += kWidth<T>) {
+      const auto v = load<kWidth<T>>(from + i + k);
+#if defined(__AVX512F__)
+      _mm512_stream_si512((__m512i*)(to + i + k), (__m512i)v);
+#elif defined(__AVX2__)
+      _mm256_stream_si256((__m256i*)(to + i + k), (__m256i)v);
+#else
+      _mm_stream_si128((__m128i*)(to + i + k), (__m128i)v);
+#endif
+    }
+  }
+#endif
+  for (; i < n; ++i) to[i] = from[i];
+}
+
+static inline void fence_stream() {
+#if defined(__SSE2__)
+  _mm_sfence();
+#endif
+}
+
 // float -> double, lower and upper half, and back.
 template <int N>
 struct Halves {
@@ -164,14 +194,10 @@ inline Vec<float, 4> narrow(Halves<4> v) {
 #endif
 
 // Pairwise sum of all lanes.
-template <typename T, int N>
+template <typename T, int N, int K = N / 2>
 inline __attribute__((always_inline)) T sum(Vec<T, N> v) {
-  T lane[N];
-  store(lane, v);
-  for (int half = N / 2; half > 0; half /= 2) {
-    for (int i = 0; i < half; ++i) lane[i] += lane[i + half];
-  }
-  return lane[0];
+  if constexpr (K > 0) return sum<T, N, K / 2>(v + shift_down<K, T, N>(v, v));
+  else return v[0];
 }
 
 template <int H, typename T, int N, int... I>

@@ -21,6 +21,9 @@ const CompositeRaysKernels<T>& kernels() {
   else return PRED_KERNELS(composite_rays_f64);
 }
 
+// From this size on, a gradient would push everything else out of the caches.
+constexpr int64_t kStreamBytes = int64_t(16) << 20;
+
 // Rays per task, such that a task takes some 100 microseconds.
 template <typename T>
 int64_t ray_grain(const CompositeRaysArgs<T>& a) {
@@ -109,7 +112,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_rays_backward(
     Inputs<T> in(op, sdf, inv_s, t, values, depth_mid, last_opaque);
     CompositeRaysArgs<T>& a = in.args;
     const int64_t rays = in.num_rays, samples = a.num_samples;
-    if (grad_values && !values) a.channels = grad_values->size(1);  // values are needed for dL/dsdf only
+    if (grad_values && !values) {  // values are needed for dL/dsdf only
+      check_cpu_tensor(op, "grad_values", *grad_values, 2, sdf.scalar_type());
+      a.channels = grad_values->size(1);
+    }
     PRED_CHECK(need_sdf || need_inv_s || weights, op, ": weights are missing");
     PRED_CHECK(values || !grad_values || !(need_sdf || need_inv_s), op, ": values are missing");
     PRED_CHECK(!need_t || grad_depth, op, ": need_t asks for grad_depth");
@@ -127,7 +133,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_rays_backward(
     std::vector<double> per_ray(need_inv_s ? rays : 0);
     const CompositeRaysGradients<T> out{need_sdf ? data<T>(out_sdf) : nullptr, need_inv_s ? per_ray.data() : nullptr,
                                         need_t ? data<T>(out_t) : nullptr,
-                                        need_values ? data<T>(out_values) : nullptr};
+                                        need_values ? data<T>(out_values) : nullptr,
+                                        rays * samples * a.channels * int64_t(sizeof(T)) >= kStreamBytes};
     if (samples > 0) {
       in.for_rays([&](const auto& k, T* scratch, int64_t begin, int64_t end) {
         k.backward(a, grad, saved, out, scratch, begin, end);

@@ -51,6 +51,7 @@ struct CompositeRaysGradients {
   double* inv_s;  // [R], each ray's part
   T* t;           // [R, S]
   T* values;      // [R, S, C]
+  bool stream_values;  // store them past the caches
 };
 
 // Ranges count rays.

@@ -25,7 +25,9 @@ struct ResampleRaysArgs {
 template <typename T>
 struct ResampleRaysKernels {
   int64_t (*scratch_size)(const ResampleRaysArgs<T>&);  // in elements, for one range
-  void (*resample)(const ResampleRaysArgs<T>&, T* merged, T* scratch, int64_t begin, int64_t end);
+  // merged [R, S + num_new]; int_scratch [S]
+  void (*resample)(const ResampleRaysArgs<T>&, T* merged, T* scratch, int32_t* int_scratch, int64_t begin,
+                   int64_t end);
 };
 
 }  // namespace pred

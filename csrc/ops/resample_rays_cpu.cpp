@@ -15,32 +15,38 @@ namespace {
 
 constexpr int64_t kPad = 16;  // at least a vector, on both sides of every row
 
+// `narrowest`: a section less probable counts as empty, so that slopes stay finite.
 template <typename T>
 struct Limits;
 template <>
 struct Limits<float> {
   static constexpr float smallest = __FLT_MIN__, largest = __FLT_MAX__, below_one = 1.0f - __FLT_EPSILON__ / 2;
+  static constexpr float narrowest = 1e-30f;
 };
 template <>
 struct Limits<double> {
   static constexpr double smallest = __DBL_MIN__, largest = __DBL_MAX__, below_one = 1.0 - __DBL_EPSILON__ / 2;
+  static constexpr double narrowest = 1e-300;
 };
 
+// Scratch rows of one ray. `u` has room for a vector on both sides.
 template <typename T>
 struct Row {
-  T *mass, *cdf, *inverse, *u, *merged;
+  T *mass, *cdf, *slope, *u, *merged;
+  int32_t* end;  // [S - 1] c_{i+1}
 };
 
 template <typename T>
 static int64_t scratch_size(const ResampleRaysArgs<T>& a) {
-  return 4 * (a.num_samples + 2 * kPad) + 2 * (a.num_new + 2 * kPad) + kPad;
+  return 4 * (a.num_samples + 2 * kPad) + 2 * (a.num_new + 2 * kPad);
 }
 
 template <typename T>
-static Row<T> make_row(const ResampleRaysArgs<T>& a, T* scratch) {
+static Row<T> make_row(const ResampleRaysArgs<T>& a, T* scratch, int32_t* int_scratch) {
   const int64_t stride = a.num_samples + 2 * kPad;
   T* first = scratch + kPad;
-  return {first, first + stride, first + 2 * stride, first + 3 * stride, first + 3 * stride + a.num_new + 2 * kPad};
+  T* u = first + 3 * stride;
+  return {first, first + stride, first + 2 * stride, u, u + a.num_new + kPad, int_scratch};
 }
 
 template <typename T>
@@ -90,45 +96,71 @@ static inline bool distribution(const T* __restrict t, const T* __restrict weigh
   return true;
 }
 
+// How a row of u lies.
+enum class Spread {
+  kEven,       // u_k is in [k, k + 1] / n: midpoints, stratified
+  kAscending,
+  kOther,
+};
+
 // Clips u to [0, 1); keeps NaN.
 template <typename T>
-static inline void copy_positions(const T* __restrict from, int64_t n, T* __restrict to) {
+static inline Spread read_positions(const T* __restrict from, int64_t n, T* __restrict to) {
   for (int64_t i = 0; i < n; ++i) {
     const T low = from[i] < T(0) ? T(0) : from[i];
     to[i] = low > Limits<T>::below_one ? Limits<T>::below_one : low;
   }
-  to[-1] = -__builtin_inf();  // ends the searches
+  to[-1] = -__builtin_inf();  // ends every search
   to[n] = __builtin_inf();
+  if (!ascending(to, n + 1)) return Spread::kOther;  // with its end, so that a single NaN is noticed
+  const T slack = T(n) * (T(1) - Limits<T>::below_one) * T(8);
+  int32_t uneven = 0;
+  for (int32_t k = 0; k < int32_t(n); ++k) {
+    const T place = to[k] * T(n) - T(k);
+    uneven |= place >= -slack && place <= T(1) + slack ? 0 : 1;
+  }
+  return uneven == 0 && slack < T(0.25) ? Spread::kEven : Spread::kAscending;
+}
+
+// row.end[i] = c_{i+1}, the number of samples with u < cdf_{i+1}. Never falls, and ends with num_new.
+template <typename T>
+static inline void section_ends(Spread spread, int64_t sections, int64_t num_new, const Row<T>& row) {
+  const T *u = row.u, *cdf = row.cdf;
+  if (spread == Spread::kEven) {
+    // All u before the place of cdf_{i+1} are below it and all after it are not, up to rounding; a sample that rounding
+    // puts into the neighbouring section is clipped to the end they share.
+    for (int64_t i = 0; i < sections; ++i) {
+      const int32_t place = int32_t(cdf[i + 1] * T(num_new));
+      row.end[i] = place + (u[place] < cdf[i + 1] ? 1 : 0);
+    }
+    return;
+  }
+  int32_t end = 0;
+  for (int64_t i = 0; i < sections; ++i) {
+    while (u[end] < cdf[i + 1]) ++end;
+    row.end[i] = end;
+  }
 }
 
 template <typename T>
-static inline void merge(const T* t, int64_t num_samples, int64_t num_new, const Row<T>& row) {
-  constexpr int W = kWidth<T> < 8 ? kWidth<T> : 8;
-  const int64_t sections = num_samples - 1;
+static inline void merge(const T* t, int64_t sections, int64_t num_new, const Row<T>& row) {
+  constexpr int W = kWidth<T>;
   const T *u = row.u, *cdf = row.cdf;
-  T* __restrict inverse = row.inverse;
+  T* __restrict slope = row.slope;
   for (int64_t i = 0; i < sections; ++i) {
     const T width = cdf[i + 1] - cdf[i];
-    inverse[i] = width >= Limits<T>::smallest ? T(1) / width : T(0);
+    slope[i] = width >= Limits<T>::narrowest ? (t[i + 1] - t[i]) / width : T(0);
   }
-  const T scale = T(num_new);
   int64_t begin = 0;  // c_i
   for (int64_t i = 0; i < sections; ++i) {
-    // c_{i+1}, guessed as for evenly spaced u.
-    const T bound = cdf[i + 1];
-    int64_t end = int64_t(bound * scale);
-    if (end > num_new) end = num_new;  // scale may be rounded up
-    end += u[end] < bound;
-    while (u[end] < bound) ++end;
-    while (u[end - 1] >= bound) --end;
-    // Lane 0 of the first vector is u[begin - 1] < cdf_i, which becomes t_i itself.
+    const int64_t end = row.end[i];
     T* out = row.merged + i + 1;
+    // Lane 0 of the first vector is u[begin - 1] < cdf_i, which becomes t_i itself.
     for (int64_t k = begin - 1; k < end; k += W) {
-      auto offset = load<W>(u + k) - cdf[i];
+      Vec<T, W> offset = load<W>(u + k) - cdf[i];
       offset = offset > T(0) ? offset : Vec<T, W>{};
-      auto x = t[i] + offset * inverse[i] * (t[i + 1] - t[i]);
-      x = x < t[i + 1] ? x : splat<W>(t[i + 1]);
-      store(out + k, x);
+      const Vec<T, W> x = t[i] + offset * slope[i], last = splat<W>(t[i + 1]);
+      store(out + k, x < last ? x : last);
     }
     begin = end;
   }
@@ -181,20 +213,19 @@ static void merge_any(const T* t, int64_t num_samples, int64_t num_new, bool has
 }
 
 template <typename T>
-static void resample(const ResampleRaysArgs<T>& a, T* merged, T* scratch, int64_t begin, int64_t end) {
-  const Row<T> row = make_row(a, scratch);
+static void resample(const ResampleRaysArgs<T>& a, T* merged, T* scratch, int32_t* int_scratch, int64_t begin,
+                     int64_t end) {
+  const Row<T> row = make_row(a, scratch, int_scratch);
   const int64_t last = a.num_samples - 1, out_size = a.num_samples + a.num_new;
-  bool u_ascends = false;
+  Spread spread = Spread::kOther;
   for (int64_t ray = begin; ray < end; ++ray) {
-    if (a.u_stride != 0 || ray == begin) {
-      copy_positions(a.u + ray * a.u_stride, a.num_new, row.u);
-      u_ascends = ascending(row.u, a.num_new + 1);  // with its end, so that a single NaN is noticed
-    }
+    if (a.u_stride != 0 || ray == begin) spread = read_positions(a.u + ray * a.u_stride, a.num_new, row.u);
     const T* t = a.t + ray * a.num_samples;
     const bool has_cdf = distribution(t, a.weights + ray * a.weight_stride, a.num_samples, row);
     const bool t_ascends = ascending(t, a.num_samples) && t[0] >= -Limits<T>::largest && t[last] <= Limits<T>::largest;
-    if (has_cdf && u_ascends && t_ascends) {
-      merge(t, a.num_samples, a.num_new, row);
+    if (has_cdf && t_ascends && spread != Spread::kOther) {
+      section_ends(spread, last, a.num_new, row);
+      merge(t, last, a.num_new, row);
     } else {
       merge_any(t, a.num_samples, a.num_new, has_cdf, row);
     }

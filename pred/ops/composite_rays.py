@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pred import _native
 from pred.ops._check import check_choice, check_like, check_shape
-from pred.ops.sdf_to_alpha import sdf_arguments, sdf_to_alpha_reference, widen
+from pred.ops.sdf_to_alpha import sdf_arguments, sdf_to_alpha_reference, valid_sharpness, widen
 
 
 class Composite(NamedTuple):
@@ -44,7 +44,8 @@ def composite_rays(
 
     Args:
         sdf: ``[R, S]`` or ``[R, S, 1]`` signed distances in metres, float32 or float64.
-        inv_s: sharpness per metre, above 0: a number, or a tensor of one element. Only a number is checked.
+        inv_s: sharpness per metre, above 0: a number, which is checked, or a tensor of one element, which gives NaN
+            where it is negative.
         t: ``[R, S]`` or ``[R, S, 1]`` range of each sample in metres, same dtype.
         values: ``[R, S, C]`` anything to be rendered, such as class probabilities, same dtype.
         depth_at: where a section's depth is read: its ``"start"`` ``t_i``, or its middle (``"mid"``); the last sample,
@@ -73,7 +74,7 @@ def composite_rays(
     if detach_sdf:
         sdf = sdf.detach()
         inv_s = inv_s.detach() if detach_inv_s else inv_s
-    if _native.use_native(op, sdf) and hasattr(torch.ops.pred, "composite_rays"):
+    if _native.use_native(op, sdf):
         weights, depth, opacity, rendered = torch.ops.pred.composite_rays(
             sdf, inv_s, t, values, depth_at == "mid", last == "opaque"
         )
@@ -101,6 +102,7 @@ def composite_rays_reference(
     if detach_sdf:
         sdf = sdf.detach()
         inv_s = inv_s.detach() if detach_inv_s else inv_s
+    inv_s = valid_sharpness(inv_s)
     alpha = sdf_to_alpha_reference(sdf, inv_s, last=last)
     # 1 - alpha_i = Phi(d_{i+1}) / Phi(d_i). The difference of logarithms is inexact for small alpha, log1p for large;
     # where() twice keeps the other branch's derivative finite.
@@ -118,7 +120,8 @@ def composite_rays_reference(
     opacity = weights.sum(dim=1)
     if normalize_depth:
         depth = depth / (opacity + normalize_eps)
-    rendered = None if values is None else torch.einsum("rs,rsc->rc", weights, values)
+    with torch.autocast(sdf.device.type, enabled=False):  # as the native op: a product in float32
+        rendered = None if values is None else torch.einsum("rs,rsc->rc", weights, values)
     return Composite(weights, depth, opacity, rendered)
 
 
@@ -148,6 +151,7 @@ def _fake(
 
 def _save(ctx: Any, inputs: Any, output: Any) -> None:
     sdf, inv_s, t, values, ctx.depth_mid, ctx.last_opaque = inputs
+    ctx.has_values = values is not None
     ctx.set_materialize_grads(False)
     if ctx.needs_input_grad[0] or ctx.needs_input_grad[1]:
         ctx.save_for_backward(sdf, inv_s, t, values, None)  # the weights are computed again
@@ -164,6 +168,7 @@ def _backward(
 ) -> tuple[Tensor | None, ...]:
     sdf, inv_s, t, values, weights = ctx.saved_tensors
     need_sdf, need_inv_s, need_t, need_values = ctx.needs_input_grad[:4]
+    grad_values = grad_values if ctx.has_values else None  # without values that output is a mere placeholder
     grads = (grad_weights, grad_depth, grad_opacity, grad_values)
     if all(grad is None for grad in grads):
         return (None,) * 6
@@ -200,6 +205,6 @@ def _fake_backward(
     )
 
 
-if _native.available() and hasattr(torch.ops.pred, "composite_rays"):
+if _native.available():
     _native.register("composite_rays", fake=_fake, setup_context=_save, backward=_backward)
     _native.register("composite_rays_backward", fake=_fake_backward)

@@ -31,8 +31,9 @@ def resample_rays(
             same dtype. Negative weights count as 0. A ray whose weights sum to 0, or to NaN or infinity, is sampled
             uniformly in ``t`` from ``t_0`` to ``t_{S-1}``.
         num_samples: samples to add to each ray.
-        u: positions in [0, 1), ascending along the last dimension, same dtype; values beyond are clipped.
-            Another order gives the same result, more slowly. None: the midpoints ``(k + 0.5) / num_samples``.
+        u: positions in [0, 1), same dtype; values beyond are clipped. Any order gives the same result; ascending is
+            fast, and fastest with one position in each ``[k, k + 1) / num_samples`` (stratified). None: their
+            midpoints.
 
     Returns:
         ``[R, S + num_samples]`` ascending along each ray, NaN last. Not differentiable: it carries no gradient.
@@ -44,7 +45,7 @@ def resample_rays(
     Deterministic for any thread count.
     """
     t, weights, u = _arguments(t, weights, num_samples, u)
-    if _native.use_native("resample_rays", t) and hasattr(torch.ops.pred, "resample_rays"):
+    if _native.use_native("resample_rays", t):
         out: Tensor = torch.ops.pred.resample_rays(t, weights, u)
         return out
     return resample_rays_reference(t, weights, num_samples, u)
@@ -60,27 +61,24 @@ def resample_rays_reference(
     """Plain PyTorch form of :func:`resample_rays`: search, interpolate, sort."""
     t, weights, u = _arguments(t, weights, num_samples, u)
     last = t.shape[1] - 2  # last section
-    start, length = t[:, :-1], t[:, 1:] - t[:, :-1]
+    length = t[:, 1:] - t[:, :-1]
     mass = weights[:, : last + 1].clamp(min=0)
     total = mass.sum(dim=1, keepdim=True)
     usable = (total >= torch.finfo(t.dtype).tiny) & (total < torch.inf)
     mass = torch.where(usable, mass, length.clamp(min=0))
-    total = mass.sum(dim=1, keepdim=True)
-    mass = torch.where(total > 0, mass / total, mass)  # all t equal: any section will do
-    cdf = torch.nn.functional.pad(mass.cumsum(dim=1), (1, 0))
-    cdf[:, -1] = torch.where(cdf[:, -1].isnan(), cdf[:, -1], 1)  # whatever the rounding of the sum
-    u = u.clamp(0, 1).expand(t.shape[0], -1).contiguous()
+    cumulative = torch.nn.functional.pad(mass.cumsum(dim=1), (1, 0))
+    total = cumulative[:, -1:]
+    cdf = torch.where(total > 0, cumulative / total, cumulative)  # ends with 1; 0 where all t are equal
+    u = u.clamp(0, 1 - torch.finfo(t.dtype).eps / 2).expand(t.shape[0], -1).contiguous()
     section = (torch.searchsorted(cdf, u, right=True) - 1).clamp(0, last)
     low, high = cdf.gather(1, section), cdf.gather(1, section + 1)
     fraction = (u - low) / torch.where(high > low, high - low, 1)
-    fraction = torch.where(total.isnan(), total, fraction)
-    samples = start.gather(1, section) + fraction * length.gather(1, section)
+    fraction = torch.where(total.isfinite(), fraction, torch.nan)  # t is not finite
+    samples = t.gather(1, section) + fraction * length.gather(1, section)
     return torch.cat([t, samples], dim=1).sort(dim=1).values
 
 
-def _arguments(
-    t: Tensor, weights: Tensor, num_samples: int, u: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
+def _arguments(t: Tensor, weights: Tensor, num_samples: int, u: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     op = "resample_rays"
     t, weights = (widen(x.detach()[..., 0] if x.dim() == 3 and x.shape[2] == 1 else x.detach()) for x in (t, weights))
     check_shape(op, "t", t, ("R", "S"))
@@ -100,9 +98,7 @@ def _arguments(
         return t, weights, u
     u = widen(u.detach())
     if u.shape != (rays, num_samples) and u.shape != (num_samples,):
-        raise ValueError(
-            f"{op}: u must have shape [{rays}, {num_samples}] or [{num_samples}], got {list(u.shape)}"
-        )
+        raise ValueError(f"{op}: u must have shape [{rays}, {num_samples}] or [{num_samples}], got {list(u.shape)}")
     check_like(op, "u", u, "t", t)
     return t, weights, u
 
@@ -119,5 +115,5 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[None, None, None]:
     return None, None, None
 
 
-if _native.available() and hasattr(torch.ops.pred, "resample_rays"):
+if _native.available():
     _native.register("resample_rays", fake=_fake, setup_context=_save, backward=_backward)

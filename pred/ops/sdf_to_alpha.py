@@ -28,8 +28,8 @@ def sdf_to_alpha(
     Args:
         sdf: ``[R, S]`` or ``[R, S, 1]`` signed distances along each ray, float32 or float64, in metres; positive in
             front of the surface.
-        inv_s: sharpness per metre, above 0: a number, or a tensor of one element on the device of ``sdf``. Only a
-            number is checked.
+        inv_s: sharpness per metre, above 0: a number, which is checked, or a tensor of one element on the device of
+            ``sdf``, which gives NaN where it is negative.
         mode: ``"pair"`` is what exists.
         last: opacity of the last sample, which has no successor: ``"zero"`` or ``"opaque"`` (1).
 
@@ -45,7 +45,7 @@ def sdf_to_alpha(
     check_choice("sdf_to_alpha", "mode", mode, ("pair",))
     check_choice("sdf_to_alpha", "last", last, ("zero", "opaque"))
     sdf, inv_s = sdf_arguments("sdf_to_alpha", sdf, inv_s)
-    if _native.use_native("sdf_to_alpha", sdf) and hasattr(torch.ops.pred, "sdf_to_alpha"):
+    if _native.use_native("sdf_to_alpha", sdf):
         out: Tensor = torch.ops.pred.sdf_to_alpha(sdf, inv_s, last == "opaque")
         return out
     return sdf_to_alpha_reference(sdf, inv_s, mode, last)
@@ -60,6 +60,7 @@ def sdf_to_alpha_reference(
     """Plain PyTorch form of :func:`sdf_to_alpha`, differentiable any number of times."""
     check_choice("sdf_to_alpha", "mode", mode, ("pair",))
     sdf, inv_s = sdf_arguments("sdf_to_alpha", sdf, inv_s)
+    inv_s = valid_sharpness(inv_s)
     drop = torch.relu(sdf[:, :-1] - sdf[:, 1:])  # relu: derivative 0 at a tie
     alpha = torch.sigmoid(-inv_s * sdf[:, 1:]) * -torch.expm1(-inv_s * drop)
     end = torch.full_like(sdf[:, :1], 1.0 if last == "opaque" else 0.0)
@@ -86,6 +87,11 @@ def sdf_arguments(op: str, sdf: Tensor, inv_s: Tensor | float) -> tuple[Tensor, 
     return sdf, inv_s.reshape(()).to(sdf.dtype)
 
 
+def valid_sharpness(inv_s: Tensor) -> Tensor:
+    """NaN in place of a negative sharpness, which means nothing."""
+    return torch.where(inv_s >= 0, inv_s, torch.full_like(inv_s, torch.nan))
+
+
 def widen(tensor: Tensor) -> Tensor:
     """In a half-precision (autocast) region: the tensor in float32 if it is narrower."""
     half = tensor.dtype in (torch.bfloat16, torch.float16)
@@ -108,12 +114,9 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     return grad_sdf if need_sdf else None, grad_inv_s if need_inv_s else None, None
 
 
-def _fake_backward(
-    grad: Tensor, sdf: Tensor, inv_s: Tensor, need_sdf: bool, need_inv_s: bool
-) -> tuple[Tensor, Tensor]:
+def _fake_backward(grad: Tensor, sdf: Tensor, inv_s: Tensor, need_sdf: bool, need_inv_s: bool) -> tuple[Tensor, Tensor]:
     return sdf.new_empty(sdf.shape if need_sdf else 0), sdf.new_empty(() if need_inv_s else 0)
 
 
-if _native.available() and hasattr(torch.ops.pred, "sdf_to_alpha"):
-    _native.register("sdf_to_alpha", fake=_fake, setup_context=_save, backward=_backward)
-    _native.register("sdf_to_alpha_backward", fake=_fake_backward)
+_native.register("sdf_to_alpha", fake=_fake, setup_context=_save, backward=_backward)
+_native.register("sdf_to_alpha_backward", fake=_fake_backward)
