@@ -131,7 +131,8 @@ class CMakeBuild(build_ext):
 
     def get_outputs(self) -> list[str]:
         package = Path(self.build_lib) / "pred"
-        return [str(path) for pattern in ("libpred_*", "_host*.so", "build_info.json") for path in package.glob(pattern)]
+        patterns = ("libpred_*", "_host*.so", "build_info.json")
+        return [str(path) for pattern in patterns for path in package.glob(pattern)]
 
     def get_output_mapping(self) -> dict[str, str]:
         return {}

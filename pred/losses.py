@@ -29,7 +29,7 @@ class LossConfig:
     """Weight of the depth term."""
     eikonal_weight: float = 0.1
     """Weight of the Eikonal term (lambda of the paper)."""
-    depth_unit_m: float = 10.0
+    depth_unit_m: float = 4.0
     """Depth errors are counted in this unit, metres: squared metres would drown the other terms."""
 
     def __post_init__(self) -> None:

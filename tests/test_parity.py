@@ -34,8 +34,8 @@ def check(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     losses, gradients = losses_and_gradients(config, "native", monkeypatch)
     expected_losses, expected_gradients = losses_and_gradients(config, "reference", monkeypatch)
     assert set(losses) == {"semantic", "depth", "eikonal", "total"} and losses["semantic"] > 0
-    for name, expected in expected_losses.items():
-        assert losses[name] == pytest.approx(expected, rel=1e-4), name
+    for name, expected_loss in expected_losses.items():
+        assert losses[name] == pytest.approx(expected_loss, rel=1e-4), name
     assert gradients.keys() == expected_gradients.keys() and len(gradients) > 20
     largest = max(float(gradient.norm()) for gradient in expected_gradients.values())
     for name, expected in expected_gradients.items():
