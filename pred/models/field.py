@@ -32,11 +32,11 @@ class FieldConfig:
     """Width of the hidden layers."""
     layers: int = 4
     """Linear layers, the output layer included."""
-    softplus_beta: float = 100.0
+    softplus_beta: float = 10.0
     """Sharpness of the Softplus; its second derivative feeds the Eikonal term."""
     frequencies: int = 6
     """Octaves of the positional encoding per axis."""
-    sdf_scale_m: float = 4.0
+    sdf_scale_m: float = 10.0
     """Metres of signed distance per unit of network output."""
     num_classes: int = 19
     """Semantic classes K (Cityscapes train ids)."""
@@ -203,13 +203,13 @@ class FieldDecoder(nn.Module):
 
         The hidden layers are drawn such that the activations are of order one everywhere in the box
         (He); octave k of the encoding starts with weights 2^-k, that is, every octave with the same
-        slope. The row is a ridge regression on the activations at random points under random
-        features, which makes it robust against the map of an untrained encoder.
+        slope, and the features of the untrained encoder start weak. The row is a ridge regression
+        on the activations at random points under random features, so the map has little say in it.
         """
         hidden_layers, output_layer = self._linear_layers()
         first = hidden_layers[0]
         octaves = (1 / self.frequencies).repeat_interleave(3)
-        first.weight[:, : self.channels].normal_(0, self.channels**-0.5)
+        first.weight[:, : self.channels].normal_(0, 0.1 * self.channels**-0.5)
         first.weight[:, self.channels :].normal_().mul_(torch.cat([torch.ones(3), octaves, octaves]))
         first.bias.uniform_(-1, 1)
         for layer in hidden_layers[1:]:

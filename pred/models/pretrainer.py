@@ -10,10 +10,13 @@ B frames, R rays per frame, N points, D point channels, C map channels, K classe
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from pred.data.batch import Batch, DepthRays, Rays, SemanticRays
 from pred.losses import LossConfig, depth_loss, eikonal_loss, mean_over_valid, semantic_loss
@@ -23,6 +26,12 @@ from pred.models.renderer import RenderedRays, Renderer, RendererConfig, Sharpne
 
 ZERO_OPACITY = 1e-3
 """Rays less opaque than this count as lost: their signed distance learns nothing from depth."""
+
+
+FIGURES = ("semantic", "depth", "eikonal", "depth_mae_m", "zero_opacity_share", "num_rays")
+"""What is summed up over the parts of a batch."""
+
+RaysT = TypeVar("RaysT", bound=Rays)
 
 
 class PretrainOutput(NamedTuple):
@@ -84,50 +93,86 @@ class Pretrainer(nn.Module):
         return self.sharpness()
 
     def forward(self, batch: Batch) -> PretrainOutput:
-        """Loss of a batch. The encoder obeys autocast; field and rendering keep full precision."""
+        """Loss of a batch. The encoder obeys autocast; field and rendering keep full precision.
+
+        The rays are rendered in parts of `samples_per_part` samples, and each part's derivatives
+        are taken before the next part is rendered: memory does not grow with the number of rays,
+        and activations stay in the cache. The result differs by rounding alone.
+        """
         bev = self.encode(batch.points, batch.point_offsets)
         with torch.autocast(bev.device.type, enabled=False):
-            return self._losses(self.field.project(bev), batch.depth, batch.semantic)
+            inv_s, frames = self.inv_s, self.field.project(bev).split(1)
+            totals = {name: torch.zeros_like(inv_s.detach()) for name in FIGURES}
 
-    def _losses(
-        self,
-        projected: Tensor,  # [B, hidden, H, W]
-        depth_rays: DepthRays,
-        semantic_rays: SemanticRays | None,
-    ) -> PretrainOutput:
-        config, inv_s = self.loss_config, self.inv_s
-        rendered = self._render_rays(projected, inv_s, depth_rays, with_gradient=True)
-        assert rendered.gradient is not None
-        hit, target_m = rendered.hit, depth_rays.depth_m
-        # Rays that do not count may hold NaN factors.
-        depth_m = rendered.depth_m * torch.where(hit, depth_rays.depth_factor, 1.0)
-        depth = depth_loss(depth_m, target_m, hit, config.depth_unit_m)
-        eikonal = eikonal_loss(rendered.gradient, hit)
-        loss = config.depth_weight * depth + config.eikonal_weight * eikonal
-        num_rays = hit.sum()
+            def parts(inv_s: Tensor, *frames: Tensor) -> Iterator[Tensor]:
+                yield from self._depth_parts(frames, inv_s, batch.depth, totals)
+                if batch.semantic is not None:
+                    yield from self._semantic_parts(frames, inv_s, batch.semantic, totals)
 
-        semantic = torch.zeros_like(loss)
-        if semantic_rays is not None:
-            seen = self._render_rays(
-                projected, inv_s, semantic_rays, semantics=True, detach_sdf=True
-            )
-            assert seen.semantics is not None
-            semantic = semantic_loss(
-                seen.semantics, semantic_rays.target, semantic_rays.confidence, seen.hit
-            )
-            loss = loss + config.semantic_weight * semantic
-            num_rays = num_rays + seen.hit.sum()
-
-        terms = {"semantic": semantic, "depth": depth, "eikonal": eikonal}
-        lost = (rendered.opacity.detach() < ZERO_OPACITY).to(loss.dtype)
+            loss = sum_of_parts(parts, [inv_s, *frames], list(self.field.parameters()))
         return PretrainOutput(
             loss=loss,
-            terms={name: term.detach() for name, term in terms.items()},
-            depth_mae_m=mean_over_valid((depth_m.detach() - target_m).abs(), hit),
-            zero_opacity_share=mean_over_valid(lost, hit),
+            terms={name: totals[name] for name in ("semantic", "depth", "eikonal")},
+            depth_mae_m=totals["depth_mae_m"],
+            zero_opacity_share=totals["zero_opacity_share"],
             inv_s=inv_s.detach(),
-            num_rays=num_rays,
+            num_rays=totals["num_rays"].long(),
         )
+
+    def _depth_parts(
+        self,
+        frames: Sequence[Tensor],  # B projected maps [1, hidden, H, W]
+        inv_s: Tensor,
+        depth_rays: DepthRays,
+        totals: dict[str, Tensor],
+    ) -> Iterator[Tensor]:
+        """Weighted loss of each part of the depth rays; adds its figures to `totals`."""
+        config = self.loss_config
+        for frame, rays, share in self._parts(depth_rays, totals):
+            rendered = self._render_rays(frames[frame], inv_s, rays, with_gradient=True)
+            assert rendered.gradient is not None
+            hit = rendered.hit
+            # Rays that do not count may hold NaN factors.
+            depth_m = rendered.depth_m * torch.where(hit, rays.depth_factor, 1.0)
+            depth = share * depth_loss(depth_m, rays.depth_m, hit, config.depth_unit_m)
+            eikonal = share * eikonal_loss(rendered.gradient, hit)
+            error_m = (depth_m - rays.depth_m).abs()
+            lost = (rendered.opacity < ZERO_OPACITY).to(depth.dtype)
+            totals["depth"] += depth.detach()
+            totals["eikonal"] += eikonal.detach()
+            totals["depth_mae_m"] += share * mean_over_valid(error_m.detach(), hit)
+            totals["zero_opacity_share"] += share * mean_over_valid(lost, hit)
+            yield config.depth_weight * depth + config.eikonal_weight * eikonal
+
+    def _semantic_parts(
+        self,
+        frames: Sequence[Tensor],  # B projected maps [1, hidden, H, W]
+        inv_s: Tensor,
+        semantic_rays: SemanticRays,
+        totals: dict[str, Tensor],
+    ) -> Iterator[Tensor]:
+        """Weighted loss of each part of the semantic rays; adds its figures to `totals`."""
+        for frame, rays, share in self._parts(semantic_rays, totals):
+            rendered = self._render_rays(frames[frame], inv_s, rays, semantics=True, detach_sdf=True)
+            assert rendered.semantics is not None
+            semantic = share * semantic_loss(
+                rendered.semantics, rays.target, rays.confidence, rendered.hit
+            )
+            totals["semantic"] += semantic.detach()
+            yield self.loss_config.semantic_weight * semantic
+
+    def _parts(self, rays: RaysT, totals: dict[str, Tensor]) -> Iterator[tuple[int, RaysT, Tensor]]:
+        """Splits rays: (frame, rays `[1, r]`, share of the valid rays of the whole batch)."""
+        hit = self.renderer.hits(rays.origins, rays.directions, rays.valid)
+        count = hit.sum()
+        totals["num_rays"] += count
+        num_frames, num_rays = hit.shape
+        step = self.renderer.rays_per_part
+        for frame in range(num_frames):
+            for start in range(0, num_rays, step):
+                part = (slice(frame, frame + 1), slice(start, start + step))
+                share = hit[part].sum() / count.clamp_min(1)
+                yield frame, replace(rays, **{k: v[part] for k, v in vars(rays).items()}), share
 
     def encode(
         self,
@@ -193,3 +238,52 @@ class Pretrainer(nn.Module):
             with_gradient=with_gradient,
             detach_sdf=detach_sdf,
         )
+
+
+def sum_of_parts(
+    parts: Callable[..., Iterable[Tensor]], inputs: Sequence[Tensor], parameters: Sequence[Tensor]
+) -> Tensor:
+    """`sum(parts(*inputs))` whose derivatives are taken part by part, as the parts come.
+
+    Value and gradient are those of the plain sum. But the graph of one part is freed before the next
+    is made, so memory does not grow with the number of parts.
+
+    Args:
+        parts: makes the parts, 0-dim tensors, lazily.
+        inputs: tensors that the parts are made from.
+        parameters: leaves with a derivative that `parts` uses besides.
+    """
+    differentiable = any(tensor.requires_grad for tensor in (*inputs, *parameters))
+    if not (differentiable and torch.is_grad_enabled()):
+        with torch.no_grad():
+            return torch.stack(list(parts(*inputs))).sum()
+    total: Tensor = _SumOfParts.apply(parts, len(inputs), *inputs, *parameters)
+    return total
+
+
+class _SumOfParts(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, parts: Callable[..., Iterable[Tensor]], num_inputs: int, *tensors: Tensor
+    ) -> Tensor:
+        # Cut off from what lies before them, where each part's backward pass would go otherwise.
+        inputs = [x.detach().requires_grad_(x.requires_grad) for x in tensors[:num_inputs]]
+        leaves = [x for x in (*inputs, *tensors[num_inputs:]) if x.requires_grad]
+        sums = [torch.zeros_like(leaf) for leaf in leaves]
+        total = torch.zeros_like(inputs[0].sum())
+        with torch.enable_grad():
+            for part in parts(*inputs):
+                gradients = torch.autograd.grad(part, leaves, allow_unused=True)
+                for sum_, gradient in zip(sums, gradients, strict=True):
+                    if gradient is not None:
+                        sum_ += gradient
+                total += part.detach()
+        ctx.save_for_backward(*sums)
+        return total
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_total: Tensor) -> tuple[Tensor | None, ...]:
+        sums = iter(ctx.saved_tensors)
+        needed = ctx.needs_input_grad[2:]
+        return None, None, *(grad_total * next(sums) if need else None for need in needed)

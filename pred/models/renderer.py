@@ -41,6 +41,8 @@ class RendererConfig:
     """Depth of a sample's weight: the sample itself (paper) or the middle of its interval."""
     normalize_depth: bool = False
     """Divide the rendered depth by the ray's opacity (not in the paper)."""
+    samples_per_part: int = 16384
+    """Training renders about so many samples at a time: bounds the memory, changes nothing else."""
 
     def __post_init__(self) -> None:
         if self.coarse_samples < 2:
@@ -50,6 +52,10 @@ class RendererConfig:
         if self.fine_samples < 0:
             raise ValueError(
                 f"RendererConfig: fine_samples must not be negative, got {self.fine_samples}"
+            )
+        if self.samples_per_part < 1:
+            raise ValueError(
+                f"RendererConfig: samples_per_part must be at least 1, got {self.samples_per_part}"
             )
         if not self.near_m >= 0:
             raise ValueError(f"RendererConfig: near_m must not be negative, got {self.near_m}")
@@ -115,6 +121,21 @@ class Renderer:
     ) -> None:
         self.config = config
         self.point_range = point_range
+
+    @property
+    def rays_per_part(self) -> int:
+        """Rays that have about `samples_per_part` samples."""
+        samples_per_ray = self.config.coarse_samples + self.config.fine_samples
+        return max(1, self.config.samples_per_part // samples_per_ray)
+
+    def hits(
+        self,
+        origins: Tensor,  # [B, R, 3]
+        directions: Tensor,  # [B, R, 3]
+        valid: Tensor,  # [B, R] bool
+    ) -> Tensor:  # [B, R] bool
+        """Rays that count: valid, finite, and with a part of the range box beyond `near_m`."""
+        return valid & ray_box_interval(origins, directions, self.point_range, self.config.near_m)[2]
 
     @torch.no_grad()
     def sample(

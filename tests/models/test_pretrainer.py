@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -17,7 +18,7 @@ from pred.data.batch import Batch, DepthRays, SemanticRays
 from pred.losses import LossConfig
 from pred.models.encoders import PillarEncoderConfig
 from pred.models.field import FieldConfig
-from pred.models.pretrainer import Pretrainer, PretrainOutput
+from pred.models.pretrainer import Pretrainer, PretrainOutput, sum_of_parts
 from pred.models.renderer import RendererConfig
 
 RANGE = (-16.0, -16.0, -5.0, 16.0, 16.0, 3.0)
@@ -285,6 +286,58 @@ def test_bf16_autocast_is_close_to_float32() -> None:
     assert output.loss.dtype == torch.float32
     assert output.loss.item() == pytest.approx(expected.loss.item(), rel=0.05)
     assert all(gradient.isfinite().all() for gradient in gradients(model, output).values())
+
+
+@pytest.mark.parametrize("samples_per_part", [1, 100, 10**9])
+def test_parts_change_nothing(samples_per_part: int) -> None:
+    """One ray, three rays or all rays at a time; some parts without a valid ray."""
+    results = []
+    for samples in (16384, samples_per_part):
+        model = make(renderer=replace(RENDERER, samples_per_part=samples))
+        batch = toy_batch()
+        batch.depth.valid[0, 4:12] = False
+        output = model(batch)
+        results.append((output, gradients(model, output)))
+    (expected, expected_gradients), (output, output_gradients) = results
+    torch.testing.assert_close(output.loss, expected.loss)
+    torch.testing.assert_close(output.terms, expected.terms)
+    torch.testing.assert_close(output[2:], expected[2:])
+    assert_same_gradients(output_gradients, expected_gradients)
+
+
+def test_sum_of_parts_is_the_sum() -> None:
+    generator = torch.Generator().manual_seed(0)
+    weight = torch.randn(3, generator=generator, dtype=torch.float64, requires_grad=True)
+    unused = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+    frozen = torch.randn(3, generator=generator, dtype=torch.float64)
+
+    def parts(x: Tensor, y: Tensor) -> Iterator[Tensor]:
+        yield (x * weight).sum()
+        yield (x.exp() * y * frozen).sum()
+
+    def total(x: Tensor) -> Tensor:
+        # The input comes from the parameter too: both ways must count, once each.
+        return 3 * sum_of_parts(parts, [x * weight, frozen], [weight, unused])
+
+    x = torch.randn(3, generator=generator, dtype=torch.float64, requires_grad=True)
+    plain = 3 * sum(parts(x * weight, frozen), torch.zeros(()))
+    torch.testing.assert_close(total(x), plain)
+    actual = torch.autograd.grad(total(x), [x, weight, unused])
+    expected = torch.autograd.grad(plain, [x, weight])
+    torch.testing.assert_close(actual, (*expected, torch.zeros_like(unused)))
+    with torch.no_grad():
+        torch.testing.assert_close(total(x), plain)
+
+
+def test_without_gradients_the_loss_is_the_same() -> None:
+    model, batch = make().eval(), toy_batch()
+    with torch.no_grad():
+        output = model(batch)
+    assert not output.loss.requires_grad
+    torch.testing.assert_close(output.loss, model(batch).loss)
+    for parameter in model.parameters():
+        parameter.requires_grad_(False)
+    assert not model(batch).loss.requires_grad
 
 
 def test_same_bits_twice(backend: str) -> None:

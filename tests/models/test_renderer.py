@@ -238,6 +238,7 @@ def test_sampling_is_constant_and_rendering_is_not() -> None:
     [
         ({"coarse_samples": 1}, "coarse_samples must be at least 2, got 1"),
         ({"fine_samples": -1}, "fine_samples must not be negative"),
+        ({"samples_per_part": 0}, "samples_per_part must be at least 1"),
         ({"near_m": math.nan}, "near_m must not be negative, got nan"),
         ({"initial_inv_s": 0.0}, "initial_inv_s must be in"),
         ({"resample_inv_s": 1e7}, "resample_inv_s must be in"),
