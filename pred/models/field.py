@@ -44,9 +44,7 @@ class FieldConfig:
     def __post_init__(self) -> None:
         for name, minimum in (("hidden", 1), ("layers", 2), ("frequencies", 0), ("num_classes", 1)):
             if getattr(self, name) < minimum:
-                raise ValueError(
-                    f"FieldConfig: {name} must be at least {minimum}, got {getattr(self, name)}"
-                )
+                raise ValueError(f"FieldConfig: {name} must be at least {minimum}, got {getattr(self, name)}")
         for name in ("softplus_beta", "sdf_scale_m"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"FieldConfig: {name} must be positive, got {getattr(self, name)}")
@@ -108,9 +106,7 @@ class FieldDecoder(nn.Module):
         encoding_width = 3 + 6 * config.frequencies
         widths = [channels + encoding_width] + [config.hidden] * (config.layers - 1)
         widths.append(1 + config.num_classes)
-        self.layers = nn.ModuleList(
-            nn.Linear(before, after) for before, after in zip(widths, widths[1:], strict=False)
-        )
+        self.layers = nn.ModuleList(nn.Linear(before, after) for before, after in zip(widths, widths[1:], strict=False))
         self._initialise()
 
     def forward(
@@ -257,9 +253,7 @@ class FieldDecoder(nn.Module):
         by_angle = (cosine * by_sine - sine * by_cosine).unflatten(-1, (self.config.frequencies, 3))
         by_position = by_position + (by_angle * self.frequencies[:, None]).sum(-2)
 
-        (by_grid,) = torch.autograd.grad(
-            sampled, grid, by_activation, create_graph=torch.is_grad_enabled()
-        )
+        (by_grid,) = torch.autograd.grad(sampled, grid, by_activation, create_graph=torch.is_grad_enabled())
         return (by_position + F.pad(by_grid, (0, 1))) / self.range_half_extent_m
 
 

@@ -155,9 +155,7 @@ class Pretrainer(nn.Module):
         for frame, rays, share in self._parts(semantic_rays, totals):
             rendered = self._render_rays(frames[frame], inv_s, rays, semantics=True, detach_sdf=True)
             assert rendered.semantics is not None
-            semantic = share * semantic_loss(
-                rendered.semantics, rays.target, rays.confidence, rendered.hit
-            )
+            semantic = share * semantic_loss(rendered.semantics, rays.target, rays.confidence, rendered.hit)
             totals["semantic"] += semantic.detach()
             yield self.loss_config.semantic_weight * semantic
 
@@ -263,9 +261,7 @@ def sum_of_parts(
 
 class _SumOfParts(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, parts: Callable[..., Iterable[Tensor]], num_inputs: int, *tensors: Tensor
-    ) -> Tensor:
+    def forward(ctx: Any, parts: Callable[..., Iterable[Tensor]], num_inputs: int, *tensors: Tensor) -> Tensor:
         # Cut off from what lies before them, where each part's backward pass would go otherwise.
         inputs = [x.detach().requires_grad_(x.requires_grad) for x in tensors[:num_inputs]]
         leaves = [x for x in (*inputs, *tensors[num_inputs:]) if x.requires_grad]

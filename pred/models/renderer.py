@@ -46,25 +46,17 @@ class RendererConfig:
 
     def __post_init__(self) -> None:
         if self.coarse_samples < 2:
-            raise ValueError(
-                f"RendererConfig: coarse_samples must be at least 2, got {self.coarse_samples}"
-            )
+            raise ValueError(f"RendererConfig: coarse_samples must be at least 2, got {self.coarse_samples}")
         if self.fine_samples < 0:
-            raise ValueError(
-                f"RendererConfig: fine_samples must not be negative, got {self.fine_samples}"
-            )
+            raise ValueError(f"RendererConfig: fine_samples must not be negative, got {self.fine_samples}")
         if self.samples_per_part < 1:
-            raise ValueError(
-                f"RendererConfig: samples_per_part must be at least 1, got {self.samples_per_part}"
-            )
+            raise ValueError(f"RendererConfig: samples_per_part must be at least 1, got {self.samples_per_part}")
         if not self.near_m >= 0:
             raise ValueError(f"RendererConfig: near_m must not be negative, got {self.near_m}")
         for name in ("initial_inv_s", "resample_inv_s"):
             value = getattr(self, name)
             if value is not None and not MIN_INV_S <= value <= MAX_INV_S:
-                raise ValueError(
-                    f"RendererConfig: {name} must be in [{MIN_INV_S}, {MAX_INV_S}], got {value}"
-                )
+                raise ValueError(f"RendererConfig: {name} must be in [{MIN_INV_S}, {MAX_INV_S}], got {value}")
 
 
 class Sharpness(nn.Module):
@@ -158,9 +150,7 @@ class Renderer:
             valid: rays to look at.
             jitter: shift of a ray's coarse samples within their strata, in [0, 1).
         """
-        t_near, t_far, crosses = ray_box_interval(
-            origins, directions, self.point_range, self.config.near_m
-        )
+        t_near, t_far, crosses = ray_box_interval(origins, directions, self.point_range, self.config.near_m)
         hit = valid & crosses
         # A ray that does not count is replaced by a harmless one, so that no NaN enters the field.
         low, high = origins.new_tensor(self.point_range).view(2, 3)

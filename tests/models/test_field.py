@@ -154,9 +154,7 @@ def test_gradcheck_of_the_eikonal_loss(backend: str) -> None:
     names = [name for name, _ in field.named_parameters()]
 
     def loss(bev: Tensor, *parameters: Tensor) -> Tensor:
-        out = torch.func.functional_call(
-            field, dict(zip(names, parameters, strict=True)), (bev, points, True, False)
-        )
+        out = torch.func.functional_call(field, dict(zip(names, parameters, strict=True)), (bev, points, True, False))
         return eikonal_loss(out.gradient[:, :, None], torch.ones(2, 3, dtype=torch.bool)) + out.sdf.sum()
 
     assert torch.autograd.gradcheck(loss, (bev.requires_grad_(), *field.parameters()))

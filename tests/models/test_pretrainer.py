@@ -36,9 +36,7 @@ FIELD = FieldConfig(hidden=32, frequencies=4, num_classes=3)
 RENDERER = RendererConfig(coarse_samples=16, fine_samples=16)
 
 
-def make(
-    field: FieldConfig = FIELD, renderer: RendererConfig = RENDERER, loss: LossConfig | None = None
-) -> Pretrainer:
+def make(field: FieldConfig = FIELD, renderer: RendererConfig = RENDERER, loss: LossConfig | None = None) -> Pretrainer:
     torch.manual_seed(0)
     return Pretrainer(ENCODER, field, renderer, loss or LossConfig(), RANGE)
 
@@ -245,15 +243,11 @@ def test_native_equals_reference(native: None, monkeypatch: pytest.MonkeyPatch) 
 
 def test_derivatives_against_finite_differences() -> None:
     """The whole loss along one direction of all parameters, with sample positions held fixed."""
-    model = make(
-        field=replace(FIELD, softplus_beta=3.0), renderer=replace(RENDERER, fine_samples=0)
-    ).double().eval()
+    model = make(field=replace(FIELD, softplus_beta=3.0), renderer=replace(RENDERER, fine_samples=0)).double().eval()
     batch = toy_batch(num_frames=1, num_rays=6)
     depth = DepthRays(**{k: v.double() if v.is_floating_point() else v for k, v in vars(batch.depth).items()})
     assert batch.semantic is not None
-    semantic = SemanticRays(
-        **{k: v.double() if v.is_floating_point() else v for k, v in vars(batch.semantic).items()}
-    )
+    semantic = SemanticRays(**{k: v.double() if v.is_floating_point() else v for k, v in vars(batch.semantic).items()})
     with torch.no_grad():  # away from the kink of ReLU, where the empty cells of a new encoder lie
         for parameter in model.encoder.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))

@@ -57,9 +57,7 @@ def render_wall(
     samples = renderer.sample(
         field, NO_MAP, sharpness, origins[None], directions[None], every[None], torch.full((1, count), 0.5)
     )
-    return samples, renderer.render(
-        field, NO_MAP, sharpness, samples, semantics=True, with_gradient=True
-    )
+    return samples, renderer.render(field, NO_MAP, sharpness, samples, semantics=True, with_gradient=True)
 
 
 @pytest.mark.parametrize(

@@ -42,15 +42,12 @@ class PillarEncoderConfig:
 
     def __post_init__(self) -> None:
         if min(self.pillar_size) <= 0:
-            raise ValueError(
-                f"PillarEncoderConfig: pillar_size must be positive, got {tuple(self.pillar_size)}"
-            )
+            raise ValueError(f"PillarEncoderConfig: pillar_size must be positive, got {tuple(self.pillar_size)}")
         if not self.vfe_filters:
             raise ValueError("PillarEncoderConfig: vfe_filters must name at least one layer, got []")
         if any(width % 2 for width in self.vfe_filters[:-1]):
             raise ValueError(
-                "PillarEncoderConfig: vfe_filters must be even for all but the last layer, "
-                f"got {self.vfe_filters}"
+                f"PillarEncoderConfig: vfe_filters must be even for all but the last layer, got {self.vfe_filters}"
             )
         blocks = len(self.layer_nums)
         for name in ("layer_strides", "num_filters", "upsample_strides", "num_upsample_filters"):
@@ -87,9 +84,7 @@ class PillarEncoder(nn.Module):
         self.voxel_size = (*(float(size) for size in config.pillar_size), float(z_max - z_min))
         self.num_columns = _whole_cells("x", x_min, x_max, self.voxel_size[0])  # nx
         self.num_rows = _whole_cells("y", y_min, y_max, self.voxel_size[1])  # ny
-        self.vfe = PillarFeatures(
-            point_channels, config.vfe_filters, self.voxel_size, self.point_range
-        )
+        self.vfe = PillarFeatures(point_channels, config.vfe_filters, self.voxel_size, self.point_range)
         self.backbone_2d = BEVBackbone(config, (self.num_rows, self.num_columns))
         self.out_channels: int = sum(config.num_upsample_filters)
 
@@ -109,9 +104,7 @@ class PillarEncoder(nn.Module):
             features, coords = self.vfe(points, point_offsets)
             # Pillars are unique, so a copy is enough. The canvas is stored channels-last, which is
             # also what the convolutions like best.
-            canvas = features.new_zeros(
-                num_frames * self.num_rows * self.num_columns, features.shape[1]
-            )
+            canvas = features.new_zeros(num_frames * self.num_rows * self.num_columns, features.shape[1])
             frame, row, column = coords[:, 0], coords[:, 2], coords[:, 3]
             cell = (frame * self.num_rows + row) * self.num_columns + column
             canvas.index_copy_(0, cell, features)
@@ -188,9 +181,7 @@ class PointLayer(nn.Module):
         # batch is normalised by the running statistics and leaves them as they are.
         norm = self.norm
         if self.training and features.shape[0] < 2:
-            return F.batch_norm(
-                features, norm.running_mean, norm.running_var, norm.weight, norm.bias, eps=norm.eps
-            )
+            return F.batch_norm(features, norm.running_mean, norm.running_var, norm.weight, norm.bias, eps=norm.eps)
         return norm(features)
 
 
@@ -224,9 +215,7 @@ class BEVBackbone(nn.Module):
                 output_sizes.append((size[0] * factor, size[1] * factor))
             else:
                 factor = round(1 / up)
-                resize = nn.Conv2d(
-                    width, config.num_upsample_filters[block], factor, stride=factor, bias=False
-                )
+                resize = nn.Conv2d(width, config.num_upsample_filters[block], factor, stride=factor, bias=False)
                 output_sizes.append((size[0] // factor, size[1] // factor))
             self.deblocks.append(
                 nn.Sequential(resize, _batch_norm(config.num_upsample_filters[block]), nn.ReLU(inplace=True))
