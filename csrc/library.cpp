@@ -40,11 +40,12 @@ STABLE_TORCH_LIBRARY(pred, m) {
 
   m.def(
       "composite_rays(Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, bool depth_mid, bool last_opaque) -> "
-      "(Tensor, Tensor, Tensor, Tensor)");
+      "(Tensor weights, Tensor depth, Tensor opacity, Tensor values, Tensor remaining)");
   m.def(
       "composite_rays_backward(Tensor? grad_weights, Tensor? grad_depth, Tensor? grad_opacity, Tensor? grad_values, "
-      "Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, Tensor? weights, bool depth_mid, bool last_opaque, "
-      "bool need_sdf, bool need_inv_s, bool need_t, bool need_values) -> (Tensor, Tensor, Tensor, Tensor)");
+      "Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, Tensor weights, Tensor remaining, bool depth_mid, "
+      "bool last_opaque, bool need_sdf, bool need_inv_s, bool need_t, bool need_values) -> "
+      "(Tensor, Tensor, Tensor, Tensor)");
 
   m.def("resample_rays(Tensor t, Tensor weights, Tensor u) -> Tensor");
 }

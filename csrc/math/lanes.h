@@ -79,9 +79,13 @@ inline __attribute__((always_inline)) Vec<T, N> shift_up(Vec<T, N> v, Vec<T, N> 
   return shuffle<T, N, (I < K ? N + I : I - K)...>(v, fill);
 }
 
-// Lane i gets lane i - K of v; the first K lanes are fill's.
+// Lane i gets lane i - K of v; the first K lanes are fill's, all of whose lanes are equal.
 template <int K, typename T, int N>
 inline __attribute__((always_inline)) Vec<T, N> shift_up(Vec<T, N> v, Vec<T, N> fill) {
+#if defined(__AVX512F__)  // one instruction, which the compiler does not find
+  if constexpr (N == 16 && sizeof(T) == 4) return (Vec<T, N>)_mm512_alignr_epi32((__m512i)v, (__m512i)fill, N - K);
+  if constexpr (N == 8 && sizeof(T) == 8) return (Vec<T, N>)_mm512_alignr_epi64((__m512i)v, (__m512i)fill, N - K);
+#endif
   return shift_up<K, T, N>(v, fill, std::make_integer_sequence<int, N>());
 }
 
@@ -91,9 +95,13 @@ inline __attribute__((always_inline)) Vec<T, N> shift_down(Vec<T, N> v, Vec<T, N
   return shuffle<T, N, (I + K < N ? I + K : N + I)...>(v, fill);
 }
 
-// Lane i gets lane i + K of v; the last K lanes are fill's.
+// Lane i gets lane i + K of v; the last K lanes are fill's, all of whose lanes are equal.
 template <int K, typename T, int N>
 inline __attribute__((always_inline)) Vec<T, N> shift_down(Vec<T, N> v, Vec<T, N> fill) {
+#if defined(__AVX512F__)
+  if constexpr (N == 16 && sizeof(T) == 4) return (Vec<T, N>)_mm512_alignr_epi32((__m512i)fill, (__m512i)v, K);
+  if constexpr (N == 8 && sizeof(T) == 8) return (Vec<T, N>)_mm512_alignr_epi64((__m512i)fill, (__m512i)v, K);
+#endif
   return shift_down<K, T, N>(v, fill, std::make_integer_sequence<int, N>());
 }
 
@@ -111,20 +119,26 @@ inline __attribute__((always_inline)) Vec<T, N> broadcast(Vec<T, N> v) {
 // Inclusive scans within a vector.
 template <typename T, int N, int K = 1>
 inline __attribute__((always_inline)) Vec<T, N> prefix_product(Vec<T, N> v) {
-  if constexpr (K < N) return prefix_product<T, N, 2 * K>(v * shift_up<K, T, N>(v, splat<N>(T(1))));
-  else return v;
+  if constexpr (K < N)
+    return prefix_product<T, N, 2 * K>(v * shift_up<K, T, N>(v, splat<N>(T(1))));
+  else
+    return v;
 }
 
 template <typename T, int N, int K = 1>
 inline __attribute__((always_inline)) Vec<T, N> prefix_sum(Vec<T, N> v) {
-  if constexpr (K < N) return prefix_sum<T, N, 2 * K>(v + shift_up<K, T, N>(v, Vec<T, N>{}));
-  else return v;
+  if constexpr (K < N)
+    return prefix_sum<T, N, 2 * K>(v + shift_up<K, T, N>(v, Vec<T, N>{}));
+  else
+    return v;
 }
 
 template <typename T, int N, int K = 1>
 inline __attribute__((always_inline)) Vec<T, N> suffix_sum(Vec<T, N> v) {
-  if constexpr (K < N) return suffix_sum<T, N, 2 * K>(v + shift_down<K, T, N>(v, Vec<T, N>{}));
-  else return v;
+  if constexpr (K < N)
+    return suffix_sum<T, N, 2 * K>(v + shift_down<K, T, N>(v, Vec<T, N>{}));
+  else
+    return v;
 }
 
 // Copies past the caches, for results too large to stay there: saves reading the destination. Whole lines only; the
@@ -157,47 +171,39 @@ static inline void fence_stream() {
 #endif
 }
 
-// float -> double, lower and upper half, and back.
-template <int N>
-struct Halves {
-  Vec<double, N / 2> low, high;
-};
+// As many elements as a vector has doubles, to and from double.
+inline __attribute__((always_inline)) Vec<double, kWidth<double>> load_wide(const double* from) {
+  return load<kWidth<double>>(from);
+}
+inline __attribute__((always_inline)) void store_narrow(double* to, Vec<double, kWidth<double>> v) { store(to, v); }
 
+inline __attribute__((always_inline)) Vec<double, kWidth<double>> load_wide(const float* from) {
 #if defined(__AVX512F__)
-inline __attribute__((always_inline)) Halves<16> widen(Vec<float, 16> v) {
-  return {_mm512_cvtps_pd(_mm512_castps512_ps256(v)), _mm512_cvtps_pd(_mm512_extractf32x8_ps(v, 1))};
-}
-inline __attribute__((always_inline)) Vec<float, 16> narrow(Halves<16> v) {
-  return _mm512_insertf32x8(_mm512_castps256_ps512(_mm512_cvtpd_ps(v.low)), _mm512_cvtpd_ps(v.high), 1);
-}
+  return _mm512_cvtps_pd(_mm256_loadu_ps(from));
 #elif defined(__AVX2__)
-inline __attribute__((always_inline)) Halves<8> widen(Vec<float, 8> v) {
-  return {_mm256_cvtps_pd(_mm256_castps256_ps128(v)), _mm256_cvtps_pd(_mm256_extractf128_ps(v, 1))};
-}
-inline __attribute__((always_inline)) Vec<float, 8> narrow(Halves<8> v) {
-  return _mm256_set_m128(_mm256_cvtpd_ps(v.high), _mm256_cvtpd_ps(v.low));
-}
-#elif defined(__SSE2__)
-inline __attribute__((always_inline)) Halves<4> widen(Vec<float, 4> v) {
-  return {_mm_cvtps_pd(v), _mm_cvtps_pd(_mm_movehl_ps(v, v))};
-}
-inline __attribute__((always_inline)) Vec<float, 4> narrow(Halves<4> v) {
-  return _mm_movelh_ps(_mm_cvtpd_ps(v.low), _mm_cvtpd_ps(v.high));
-}
+  return _mm256_cvtps_pd(_mm_loadu_ps(from));
 #else
-inline Halves<4> widen(Vec<float, 4> v) {
-  return {Vec<double, 2>{v[0], v[1]}, Vec<double, 2>{v[2], v[3]}};
-}
-inline Vec<float, 4> narrow(Halves<4> v) {
-  return Vec<float, 4>{float(v.low[0]), float(v.low[1]), float(v.high[0]), float(v.high[1])};
-}
+  return Vec<double, 2>{from[0], from[1]};
 #endif
+}
+inline __attribute__((always_inline)) void store_narrow(float* to, Vec<double, kWidth<double>> v) {
+#if defined(__AVX512F__)
+  _mm256_storeu_ps(to, _mm512_cvtpd_ps(v));
+#elif defined(__AVX2__)
+  _mm_storeu_ps(to, _mm256_cvtpd_ps(v));
+#else
+  to[0] = float(v[0]);
+  to[1] = float(v[1]);
+#endif
+}
 
 // Pairwise sum of all lanes.
 template <typename T, int N, int K = N / 2>
 inline __attribute__((always_inline)) T sum(Vec<T, N> v) {
-  if constexpr (K > 0) return sum<T, N, K / 2>(v + shift_down<K, T, N>(v, v));
-  else return v[0];
+  if constexpr (K > 0)
+    return sum<T, N, K / 2>(v + shift_down<K, T, N>(v, v));
+  else
+    return v[0];
 }
 
 template <int H, typename T, int N, int... I>

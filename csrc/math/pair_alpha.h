@@ -19,11 +19,8 @@ struct Phi {
 };
 
 template <typename V, typename T>
-PRED_HOST_DEVICE Phi<V> phi(T inv_s, V sdf) {
-  const V sharpness = inv_s - V{}, distance = negative_magnitude(sdf);
-  const V x = sharpness * distance;
-  // Where |x| is 80, half a unit in its last place is worth 4e-6 of the result: carry the rounding error along.
-  const V e = exp_nonpositive(x, product_error(sharpness, distance, x)).exp;
+PRED_HOST_DEVICE Phi<V> phi(const ExpScale<T>& s, V sdf) {
+  const V e = exp_nonpositive(s, negative_magnitude(sdf)).exp;
   const V large = T(1) / (T(1) + e);
   const V small = e * large;
   return {sdf < V{} ? small : large, sdf < V{} ? large : small};
@@ -38,9 +35,9 @@ struct PairAlpha {
 };
 
 template <typename V, typename T>
-PRED_HOST_DEVICE PairAlpha<V> pair_alpha(T inv_s, V sdf, V next_sdf, Phi<V> next) {
+PRED_HOST_DEVICE PairAlpha<V> pair_alpha(const ExpScale<T>& s, V sdf, V next_sdf, Phi<V> next) {
   const V rise = next_sdf - sdf;
-  const Exp<V> e = exp_nonpositive(inv_s * (rise >= V{} ? V{} : rise), -V{});  // NaN stays NaN
+  const Exp<V> e = exp_nonpositive(s, rise >= V{} ? V{} : rise);  // NaN stays NaN
   return {next.occupied * -e.expm1, next.free + next.occupied * e.exp, e.exp, -e.expm1};
 }
 

@@ -17,8 +17,10 @@ namespace {
 
 template <typename T>
 const CompositeRaysKernels<T>& kernels() {
-  if constexpr (std::is_same_v<T, float>) return PRED_KERNELS(composite_rays_f32);
-  else return PRED_KERNELS(composite_rays_f64);
+  if constexpr (std::is_same_v<T, float>)
+    return PRED_KERNELS(composite_rays_f32);
+  else
+    return PRED_KERNELS(composite_rays_f64);
 }
 
 // From this size on, a gradient would push everything else out of the caches.
@@ -34,7 +36,7 @@ int64_t ray_grain(const CompositeRaysArgs<T>& a) {
 template <typename T>
 struct Inputs {
   Tensor sdf, t, values;
-  std::vector<Tensor> grads;
+  std::vector<Tensor> kept;
   CompositeRaysArgs<T> args;
   int64_t num_rays;
 
@@ -48,8 +50,14 @@ struct Inputs {
     check_sizes(op, "t", t_in, {num_rays, sdf_in.size(1)});
     sdf = torch::stable::contiguous(sdf_in);
     t = torch::stable::contiguous(t_in);
-    args = {sdf.const_data_ptr<T>(), t.const_data_ptr<T>(), nullptr, valid_sharpness(*inv_s.const_data_ptr<T>()),
-            sdf.size(1), 0, depth_mid, last_opaque};
+    args = {sdf.const_data_ptr<T>(),
+            t.const_data_ptr<T>(),
+            nullptr,
+            valid_sharpness(*inv_s.const_data_ptr<T>()),
+            sdf.size(1),
+            0,
+            depth_mid,
+            last_opaque};
     if (!values_in) return;
     check_cpu_tensor(op, "values", *values_in, 3, dtype);
     check_sizes(op, "values", *values_in, {num_rays, args.num_samples, values_in->size(2)});
@@ -58,12 +66,13 @@ struct Inputs {
     args.channels = values.size(2);
   }
 
-  const T* grad(const char* op, const char* name, const std::optional<Tensor>& tensor, std::vector<int64_t> shape) {
+  // Of a contiguous copy, if need be; null where there is no tensor.
+  const T* pointer(const char* op, const char* name, const std::optional<Tensor>& tensor, std::vector<int64_t> shape) {
     if (!tensor) return nullptr;
     check_cpu_tensor(op, name, *tensor, int64_t(shape.size()), sdf.scalar_type());
     check_sizes(op, name, *tensor, shape);
-    grads.push_back(torch::stable::contiguous(*tensor));
-    return grads.back().const_data_ptr<T>();
+    kept.push_back(torch::stable::contiguous(*tensor));
+    return kept.back().const_data_ptr<T>();
   }
 
   template <class Body>
@@ -81,32 +90,35 @@ T* data(Tensor& tensor) {
   return tensor.mutable_data_ptr<T>();
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor> composite_rays(const Tensor& sdf, const Tensor& inv_s, const Tensor& t,
-                                                          std::optional<Tensor> values, bool depth_mid,
-                                                          bool last_opaque) {
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> composite_rays(const Tensor& sdf, const Tensor& inv_s,
+                                                                  const Tensor& t, std::optional<Tensor> values,
+                                                                  bool depth_mid, bool last_opaque) {
   return PRED_DISPATCH_FLOAT("composite_rays", sdf.scalar_type(), [&] {
     const Inputs<T> in("composite_rays", sdf, inv_s, t, values, depth_mid, last_opaque);
     const CompositeRaysArgs<T>& a = in.args;
     Tensor weights = torch::stable::new_empty(sdf, {in.num_rays, a.num_samples});
     Tensor depth = torch::stable::new_empty(sdf, {in.num_rays});
     Tensor opacity = torch::stable::new_empty(sdf, {in.num_rays});
-    Tensor rendered = values ? torch::stable::new_empty(sdf, {in.num_rays, a.channels})
-                             : torch::stable::new_empty(sdf, {0});
+    Tensor rendered =
+        values ? torch::stable::new_empty(sdf, {in.num_rays, a.channels}) : torch::stable::new_empty(sdf, {0});
+    Tensor remaining = torch::stable::new_empty(sdf, {in.num_rays});
     if (a.num_samples == 0) {
       for (Tensor* empty : {&depth, &opacity, &rendered}) torch::stable::zero_(*empty);
-      return std::make_tuple(weights, depth, opacity, rendered);
+      torch::stable::fill_(remaining, 1.0);
+      return std::make_tuple(weights, depth, opacity, rendered, remaining);
     }
-    const CompositeRaysOutputs<T> out{data<T>(weights), data<T>(depth), data<T>(opacity), data<T>(rendered)};
+    const CompositeRaysOutputs<T> out{data<T>(weights), data<T>(depth), data<T>(opacity), data<T>(rendered),
+                                      data<T>(remaining)};
     in.for_rays([&](const auto& k, T* scratch, int64_t begin, int64_t end) { k.forward(a, out, scratch, begin, end); });
-    return std::make_tuple(weights, depth, opacity, rendered);
+    return std::make_tuple(weights, depth, opacity, rendered, remaining);
   });
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> composite_rays_backward(
     std::optional<Tensor> grad_weights, std::optional<Tensor> grad_depth, std::optional<Tensor> grad_opacity,
     std::optional<Tensor> grad_values, const Tensor& sdf, const Tensor& inv_s, const Tensor& t,
-    std::optional<Tensor> values, std::optional<Tensor> weights, bool depth_mid, bool last_opaque, bool need_sdf,
-    bool need_inv_s, bool need_t, bool need_values) {
+    std::optional<Tensor> values, const Tensor& weights, const Tensor& remaining, bool depth_mid, bool last_opaque,
+    bool need_sdf, bool need_inv_s, bool need_t, bool need_values) {
   return PRED_DISPATCH_FLOAT("composite_rays_backward", sdf.scalar_type(), [&] {
     const char* op = "composite_rays_backward";
     Inputs<T> in(op, sdf, inv_s, t, values, depth_mid, last_opaque);
@@ -116,15 +128,15 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_rays_backward(
       check_cpu_tensor(op, "grad_values", *grad_values, 2, sdf.scalar_type());
       a.channels = grad_values->size(1);
     }
-    PRED_CHECK(need_sdf || need_inv_s || weights, op, ": weights are missing");
     PRED_CHECK(values || !grad_values || !(need_sdf || need_inv_s), op, ": values are missing");
     PRED_CHECK(!need_t || grad_depth, op, ": need_t asks for grad_depth");
     PRED_CHECK(!need_values || grad_values, op, ": need_values asks for grad_values");
-    const CompositeRaysCotangents<T> grad{in.grad(op, "grad_weights", grad_weights, {rays, samples}),
-                                          in.grad(op, "grad_depth", grad_depth, {rays}),
-                                          in.grad(op, "grad_opacity", grad_opacity, {rays}),
-                                          in.grad(op, "grad_values", grad_values, {rays, a.channels})};
-    const T* saved = need_sdf || need_inv_s ? nullptr : in.grad(op, "weights", weights, {rays, samples});
+    const CompositeRaysCotangents<T> grad{in.pointer(op, "grad_weights", grad_weights, {rays, samples}),
+                                          in.pointer(op, "grad_depth", grad_depth, {rays}),
+                                          in.pointer(op, "grad_opacity", grad_opacity, {rays}),
+                                          in.pointer(op, "grad_values", grad_values, {rays, a.channels})};
+    const CompositeRaysSaved<T> saved{in.pointer(op, "weights", weights, {rays, samples}),
+                                      in.pointer(op, "remaining", remaining, {rays})};
     const auto output = [&](bool need, std::vector<int64_t> shape) {
       return torch::stable::new_empty(sdf, need ? shape : std::vector<int64_t>{0});
     };
@@ -132,12 +144,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_rays_backward(
     Tensor out_t = output(need_t, {rays, samples}), out_values = output(need_values, {rays, samples, a.channels});
     std::vector<double> per_ray(need_inv_s ? rays : 0);
     const CompositeRaysGradients<T> out{need_sdf ? data<T>(out_sdf) : nullptr, need_inv_s ? per_ray.data() : nullptr,
-                                        need_t ? data<T>(out_t) : nullptr,
-                                        need_values ? data<T>(out_values) : nullptr,
+                                        need_t ? data<T>(out_t) : nullptr, need_values ? data<T>(out_values) : nullptr,
                                         rays * samples * a.channels * int64_t(sizeof(T)) >= kStreamBytes};
     if (samples > 0) {
       in.for_rays([&](const auto& k, T* scratch, int64_t begin, int64_t end) {
-        k.backward(a, grad, saved, out, scratch, begin, end);
+        k.backward(a, saved, grad, out, scratch, begin, end);
       });
     }
     if (need_inv_s) {  // one thread, in order: the same bits for any number of threads

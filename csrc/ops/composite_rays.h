@@ -6,6 +6,7 @@
 // With opacities alpha_i of math/pair_alpha.h and T_i = prod_{j<i} (1 - alpha_j):
 //   forward   w_i = T_i alpha_i;  depth = sum w_i p_i, opacity = sum w_i, channels = sum w_i v_i
 //   backward  A_i = dL/dw_i, from all outputs;  S_i = sum_{j>i} w_j A_j
+//             T_i = sum_{j>=i} w_j + T_end, from the saved weights
 //             H_i = -dL/dlog(1 - alpha_i) = T_{i+1} A_i - S_i where the distance falls from i to i + 1, else 0
 //             dL/d(s d_i) = Phi(-s d_i) (H_i - H_{i-1})
 // since log(1 - alpha_i) = log Phi(s d_{i+1}) - log Phi(s d_i). Nothing is divided, so opacities of 0 and 1 are exact.
@@ -29,10 +30,18 @@ struct CompositeRaysArgs {
 
 template <typename T>
 struct CompositeRaysOutputs {
-  T* weights;  // [R, S]
-  T* depth;    // [R]
-  T* opacity;  // [R]
-  T* values;   // [R, C] or null
+  T* weights;    // [R, S]
+  T* depth;      // [R]
+  T* opacity;    // [R]
+  T* values;     // [R, C] or null
+  T* remaining;  // [R] transmittance behind the last sample
+};
+
+// What the backward pass takes from the forward pass.
+template <typename T>
+struct CompositeRaysSaved {
+  const T* weights;    // [R, S]
+  const T* remaining;  // [R]
 };
 
 // Gradients of the outputs; null where absent.
@@ -47,10 +56,10 @@ struct CompositeRaysCotangents {
 // Gradients of the inputs; null where not wanted.
 template <typename T>
 struct CompositeRaysGradients {
-  T* sdf;         // [R, S]
-  double* inv_s;  // [R], each ray's part
-  T* t;           // [R, S]
-  T* values;      // [R, S, C]
+  T* sdf;              // [R, S]
+  double* inv_s;       // [R], each ray's part
+  T* t;                // [R, S]
+  T* values;           // [R, S, C]
   bool stream_values;  // store them past the caches
 };
 
@@ -59,8 +68,7 @@ template <typename T>
 struct CompositeRaysKernels {
   int64_t (*scratch_size)(const CompositeRaysArgs<T>&);  // in elements, for one range
   void (*forward)(const CompositeRaysArgs<T>&, const CompositeRaysOutputs<T>&, T* scratch, int64_t begin, int64_t end);
-  // `weights` [R, S], the forward pass's, replaces sdf and inv_s where neither needs a gradient; else null.
-  void (*backward)(const CompositeRaysArgs<T>&, const CompositeRaysCotangents<T>&, const T* weights,
+  void (*backward)(const CompositeRaysArgs<T>&, const CompositeRaysSaved<T>&, const CompositeRaysCotangents<T>&,
                    const CompositeRaysGradients<T>&, T* scratch, int64_t begin, int64_t end);
 };
 

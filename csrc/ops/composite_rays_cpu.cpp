@@ -1,25 +1,26 @@
 // Copyright 2026 The PRED authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// One iteration owns one ray and writes that ray's rows only. A forward sweep in vectors of samples carries the
-// transmittance, a backward sweep the sum of what lies behind. What one sweep leaves for the next is in scratch rows,
-// which stay in the nearest cache. They are padded to whole vectors: the padding repeats the last distance, so that its
-// opacity is 0.
-#include "ops/composite_rays.h"
-
+// One iteration owns one ray and writes that ray's rows only. Loops over vectors of samples are short, and hand over
+// through scratch rows in the nearest cache: with fewer instructions per vector, more vectors are in flight at once.
+// Rows are padded to whole vectors; the padding repeats the last distance, so that its opacity is 0.
 #include "math/lanes.h"
+#include "ops/composite_rays.h"
 
 namespace pred::PRED_ISA {
 namespace {
 
 constexpr int64_t kBlock = 16;  // a multiple of every vector width
 constexpr int64_t kChunk = 64;  // samples between turns of computing opacities and of using them on channels
+constexpr int64_t kLead = 2 * kChunk;
 
-// Scratch rows of one ray; elements -1 and `size` exist in each.
+// Scratch rows of one ray; elements -1 and `size` exist in each. Where a tensor's rows need no padding, they are used
+// in their place.
 template <typename T>
 struct Ray {
   int64_t num_samples, size;  // size: padded
-  T *sdf, *position, *weight, *transmittance, *occupied, *cotangent, *slope, *alpha, *passed;
+  bool whole;                 // they are equal
+  T *sdf, *position, *weight, *free, *occupied, *alpha, *passed, *cotangent, *slope;
   T* channels;  // [C] in blocks of a vector's width
   T* buffer;    // [kBlock, C]
 };
@@ -40,8 +41,9 @@ static Ray<T> make_ray(const CompositeRaysArgs<T>& a, T* scratch) {
   Ray<T> ray;
   ray.num_samples = a.num_samples;
   ray.size = size;
-  for (T** at : {&ray.sdf, &ray.position, &ray.weight, &ray.transmittance, &ray.occupied, &ray.cotangent, &ray.slope,
-                 &ray.alpha, &ray.passed}) {
+  ray.whole = size == a.num_samples;
+  for (T** at : {&ray.sdf, &ray.position, &ray.weight, &ray.free, &ray.occupied, &ray.alpha, &ray.passed,
+                 &ray.cotangent, &ray.slope}) {
     row[-1] = T(0);
     for (int64_t i = a.num_samples; i <= size; ++i) row[i] = T(0);
     *at = row;
@@ -57,60 +59,35 @@ static inline void copy_row(const T* __restrict from, T* __restrict to, int64_t 
   for (int64_t i = 0; i < n; ++i) to[i] = from[i];
 }
 
-// What the memory system fetches while opacities are computed, a little with each vector: the values that the next chunk
-// needs, and the next ray's rows. Addresses past a tensor's end do no harm.
+// What the memory system fetches meanwhile: the next ray's rows, and values some chunks ahead. A few lines with each
+// vector of each loop, since requests that come too fast are lost. Addresses past a tensor's end do no harm.
 template <typename T>
 struct Ahead {
   const T *next_sdf, *next_t;  // [S]
   const T* output;             // [S], to be written
-  const T* values;             // [S, channels], a chunk ahead
-  int64_t channels;
+  uintptr_t values;            // the next line
+  int64_t lines;               // at a time
 
-  inline __attribute__((always_inline)) void fetch(int64_t i, int64_t count) const {
-    constexpr int64_t line = 64 / int64_t(sizeof(T));
+  inline __attribute__((always_inline)) void fetch_rows(int64_t i) const {
     __builtin_prefetch(next_sdf + i);
     __builtin_prefetch(next_t + i);
     __builtin_prefetch(output + i, 1);
-    for (int64_t k = i * channels; k < (i + count) * channels; k += line) __builtin_prefetch(values + k);
+  }
+
+  inline __attribute__((always_inline)) void fetch_values() {
+    for (int64_t k = 0; k < lines; ++k, values += 64) __builtin_prefetch((const void*)values);
   }
 };
 
+// `loops`: how many loops over a ray's vectors call fetch_values.
 template <typename T>
-static inline Ahead<T> look_ahead(const CompositeRaysArgs<T>& a, int64_t index, int64_t end, const T* output) {
-  const int64_t next = index + 1 < end ? index + 1 : index;
-  const T* values = (const T*)(uintptr_t(a.values) + (index * a.num_samples + kChunk) * a.channels * sizeof(T));
-  return {a.sdf + next * a.num_samples, a.t + next * a.num_samples, output, values, a.channels};
+static inline Ahead<T> look_ahead(const CompositeRaysArgs<T>& a, int64_t index, int64_t end, const T* output,
+                                  int64_t loops) {
+  const int64_t next = index + 1 < end ? index + 1 : index, vector_bytes = kVectorBytes * a.channels;
+  const uintptr_t values = uintptr_t(a.values) + (index * a.num_samples + kLead) * a.channels * sizeof(T);
+  return {a.sdf + next * a.num_samples, a.t + next * a.num_samples, output, values,
+          (vector_bytes / 64 + loops - 1) / loops};
 }
-
-// prod_{j<i} (1 - alpha_j) for the lanes i of a vector, and onwards. In double, so that small opacities count in full.
-template <typename T>
-struct Transmittance {
-  static constexpr int W = kWidth<double>;
-  using Wide = Vec<double, W>;
-  using V = Vec<T, kWidth<T>>;
-  Wide carry = splat<W>(1.0);
-
-  static inline __attribute__((always_inline)) Wide factor(Wide alpha, Wide passed) {
-    return alpha < 0.5 ? 1.0 - alpha : passed;
-  }
-
-  inline __attribute__((always_inline)) Wide advance(Wide factors) {
-    const Wide product = prefix_product<double, W>(factors);
-    const Wide before = carry * shift_up<1, double, W>(product, splat<W>(1.0));
-    carry = carry * broadcast<W - 1, double, W>(product);
-    return before;
-  }
-
-  inline __attribute__((always_inline)) V operator()(V alpha, V passed) {
-    if constexpr (sizeof(T) == sizeof(double)) {
-      return advance(factor(alpha, passed));
-    } else {
-      const auto a = widen(alpha), p = widen(passed);
-      const Wide low = advance(factor(a.low, p.low));
-      return narrow({low, advance(factor(a.high, p.high))});
-    }
-  }
-};
 
 template <typename T>
 static inline void read_distances(const CompositeRaysArgs<T>& a, int64_t index, const Ray<T>& ray) {
@@ -120,51 +97,66 @@ static inline void read_distances(const CompositeRaysArgs<T>& a, int64_t index, 
   ray.sdf[-1] = ray.sdf[0];
 }
 
-// Fills the weights of samples [begin, end); for the backward pass their transmittance and `occupied` too.
-template <bool kBackward, typename T>
-static inline void weigh(const CompositeRaysArgs<T>& a, const Ray<T>& ray, int64_t begin, int64_t end,
-                         const Ahead<T>& ahead, Transmittance<T>& transmittance) {
+// Fills the weights of samples [begin, end), and of padding. `transmittance` is that of sample `begin`, then of `end`.
+template <typename T>
+static inline void weigh(const ExpScale<T>& s, bool last_opaque, const Ray<T>& ray, int64_t begin, int64_t end,
+                         Ahead<T>& ahead, double& transmittance, T* weight) {
   constexpr int W = kWidth<T>;
   using V = Vec<T, W>;
-  const T inv_s = a.inv_s;
-  // Two loops: one chain of both would hold so many instructions that few vectors are in flight at once.
   for (int64_t i = begin; i < end; i += W) {
-    ahead.fetch(i, W);
-    const V sdf = load<W>(ray.sdf + i), next_sdf = load<W>(ray.sdf + i + 1);
-    const Phi<V> next = phi(inv_s, next_sdf);
-    const PairAlpha<V> pair = pair_alpha(inv_s, sdf, next_sdf, next);
+    ahead.fetch_rows(i);
+    ahead.fetch_values();
+    const Phi<V> next = phi(s, load<W>(ray.sdf + i + 1));
+    store(ray.free + i, next.free);
+    store(ray.occupied + i, next.occupied);
+  }
+  for (int64_t i = begin; i < end; i += W) {
+    ahead.fetch_values();
+    const Phi<V> next{load<W>(ray.free + i), load<W>(ray.occupied + i)};
+    const PairAlpha<V> pair = pair_alpha(s, load<W>(ray.sdf + i), load<W>(ray.sdf + i + 1), next);
     store(ray.alpha + i, pair.alpha);
     store(ray.passed + i, pair.passed);
-    if (kBackward) store(ray.occupied + i + 1, next.occupied);
   }
   const int64_t last = ray.num_samples - 1;
   if (end > last) {
-    ray.alpha[last] = a.last_opaque ? T(1) : T(0);
+    ray.alpha[last] = last_opaque ? T(1) : T(0);
+    ray.passed[last] = last_opaque ? T(0) : T(1);
     for (int64_t i = last + 1; i < end; ++i) ray.alpha[i] = T(0);
   }
-  for (int64_t i = begin; i < end; i += W) {
-    const V alpha = load<W>(ray.alpha + i), before = transmittance(alpha, load<W>(ray.passed + i));
-    store(ray.weight + i, before * alpha);
-    if (kBackward) store(ray.transmittance + i, before);
+  // w_i = alpha_i prod_{j<i} (1 - alpha_j), in double, so that small opacities count in full.
+  constexpr int D = kWidth<double>;
+  using Wide = Vec<double, D>;
+  const Wide one = splat<D>(1.0);
+  Wide before = splat<D>(transmittance);
+  for (int64_t i = begin; i < end; i += D) {
+    if (i % W == 0) ahead.fetch_values();
+    const Wide alpha = load_wide(ray.alpha + i), passed = load_wide(ray.passed + i);
+    const Wide product = prefix_product<double, D>(alpha < 0.5 ? one - alpha : passed);
+    store_narrow(weight + i, before * shift_up<1, double, D>(product, one) * alpha);
+    before = before * broadcast<D - 1, double, D>(product);
   }
+  transmittance = before[0];
   if (end > last) {
-    for (int64_t i = last + 1; i < end; ++i) ray.weight[i] = T(0);  // 0 times NaN
+    for (int64_t i = last + 1; i < end; ++i) weight[i] = T(0);  // 0 times NaN
   }
 }
 
-// Where each weight is counted.
+// Where each weight is counted, 0 in the padding.
 template <typename T>
-static inline void place(const CompositeRaysArgs<T>& a, int64_t index, const Ray<T>& ray) {
-  const T* __restrict t = a.t + index * ray.num_samples;
-  copy_row(t, ray.position, ray.num_samples);
-  if (!a.depth_mid) return;
+static inline const T* positions(const CompositeRaysArgs<T>& a, int64_t index, const Ray<T>& ray) {
   constexpr int W = kWidth<T>;
-  const int64_t last = ray.num_samples - 1;
-  for (int64_t i = 0; i < last; i += W) {
-    store(ray.position + i, T(0.5) * (load<W>(ray.position + i) + load<W>(ray.position + i + 1)));
+  const T* t = a.t + index * ray.num_samples;
+  if (ray.whole && !a.depth_mid) return t;
+  copy_row(t, ray.position, ray.num_samples);
+  if (a.depth_mid) {
+    const int64_t last = ray.num_samples - 1;
+    for (int64_t i = 0; i < last; i += W) {
+      store(ray.position + i, T(0.5) * (load<W>(ray.position + i) + load<W>(ray.position + i + 1)));
+    }
+    ray.position[last] = t[last];
+    for (int64_t i = last + 1; i < ray.size; ++i) ray.position[i] = T(0);
   }
-  for (int64_t i = last + 1; i < ray.size; ++i) ray.position[i] = T(0);
-  ray.position[last] = t[last];
+  return ray.position;
 }
 
 // --- Channels, in blocks of W columns ------------------------------------------------------------
@@ -183,8 +175,8 @@ static inline int64_t block_offset(int64_t block, int64_t channels) {
 }
 
 template <int W, int kBlocks, typename T>
-static inline void render_blocks(const T* weight, const T* values, int64_t num_samples, int64_t channels,
-                                 int64_t first, T* sum) {
+static inline void render_blocks(const T* weight, const T* values, int64_t num_samples, int64_t channels, int64_t first,
+                                 T* sum) {
   Vec<T, W> even[kBlocks], odd[kBlocks] = {};  // two chains of sums are faster than one
   int64_t offset[kBlocks];
   for (int b = 0; b < kBlocks; ++b) {
@@ -214,10 +206,17 @@ static void render_channels(const T* weight, const T* values, int64_t num_sample
   const int64_t blocks = num_blocks<W>(channels);
   for (int64_t first = 0; first < blocks; first += kMaxBlocks) {
     switch (blocks - first) {
-      case 1: render_blocks<W, 1>(weight, values, num_samples, channels, first, sum); break;
-      case 2: render_blocks<W, 2>(weight, values, num_samples, channels, first, sum); break;
-      case 3: render_blocks<W, 3>(weight, values, num_samples, channels, first, sum); break;
-      default: render_blocks<W, 4>(weight, values, num_samples, channels, first, sum);
+      case 1:
+        render_blocks<W, 1>(weight, values, num_samples, channels, first, sum);
+        break;
+      case 2:
+        render_blocks<W, 2>(weight, values, num_samples, channels, first, sum);
+        break;
+      case 3:
+        render_blocks<W, 3>(weight, values, num_samples, channels, first, sum);
+        break;
+      default:
+        render_blocks<W, 4>(weight, values, num_samples, channels, first, sum);
     }
   }
 }
@@ -271,24 +270,33 @@ static inline void channel_gradient_tile(const T* weight, const T* values, int64
 // All blocks of up to kBlock samples.
 template <int W, bool kDot, bool kOuter, typename T>
 static inline void channel_gradient_block(const T* weight, const T* values, int64_t count, int64_t channels,
-                                          const T* grad, const T* once, T* cotangent, T* grad_values) {
+                                          const T* grad, const T* once, T* cotangent, T* grad_values, Ahead<T>& ahead) {
   const int64_t blocks = num_blocks<W>(channels);
   for (int64_t i = 0; i < count; i += W) {
+    if (kDot) ahead.fetch_values();
     for (int64_t first = 0; first < blocks; first += kMaxBlocks) {
-#define PRED_TILE(n, full)                                                                                     \
+#define PRED_TILE(n, full)                                                                                             \
   channel_gradient_tile<W, n, kDot, kOuter, full>(weight + i, values + i * channels, count - i, channels, first, grad, \
                                                   once, cotangent + i, grad_values + i * channels)
       const int64_t left = blocks - first;
       if (i + W <= count) {
-        if (left == 1) PRED_TILE(1, true);
-        else if (left == 2) PRED_TILE(2, true);
-        else if (left == 3) PRED_TILE(3, true);
-        else PRED_TILE(4, true);
+        if (left == 1)
+          PRED_TILE(1, true);
+        else if (left == 2)
+          PRED_TILE(2, true);
+        else if (left == 3)
+          PRED_TILE(3, true);
+        else
+          PRED_TILE(4, true);
       } else {
-        if (left == 1) PRED_TILE(1, false);
-        else if (left == 2) PRED_TILE(2, false);
-        else if (left == 3) PRED_TILE(3, false);
-        else PRED_TILE(4, false);
+        if (left == 1)
+          PRED_TILE(1, false);
+        else if (left == 2)
+          PRED_TILE(2, false);
+        else if (left == 3)
+          PRED_TILE(3, false);
+        else
+          PRED_TILE(4, false);
       }
 #undef PRED_TILE
     }
@@ -298,17 +306,18 @@ static inline void channel_gradient_block(const T* weight, const T* values, int6
 // A chunk. `buffer` has room for kBlock samples; `stream`: store grad_values past the caches.
 template <int W, bool kDot, bool kOuter, typename T>
 static void channel_gradients(const T* weight, const T* values, int64_t num_samples, int64_t channels, const T* grad,
-                              const T* once, T* cotangent, T* grad_values, T* buffer, bool stream) {
+                              const T* once, T* cotangent, T* grad_values, T* buffer, bool stream, Ahead<T>& ahead) {
   if constexpr (W > 1) {
     if (channels < W) {
       return channel_gradients<W / 2, kDot, kOuter>(weight, values, num_samples, channels, grad, once, cotangent,
-                                                    grad_values, buffer, stream);
+                                                    grad_values, buffer, stream, ahead);
     }
   }
   for (int64_t i = 0; i < num_samples; i += kBlock) {
     const int64_t count = num_samples - i < kBlock ? num_samples - i : kBlock, at = i * channels;
     T* out = stream ? buffer : grad_values + at;
-    channel_gradient_block<W, kDot, kOuter>(weight + i, values + at, count, channels, grad, once, cotangent + i, out);
+    channel_gradient_block<W, kDot, kOuter>(weight + i, values + at, count, channels, grad, once, cotangent + i, out,
+                                            ahead);
     if (kOuter && stream) stream_row(buffer, grad_values + at, count * channels);
   }
 }
@@ -320,28 +329,30 @@ static void forward(const CompositeRaysArgs<T>& a, const CompositeRaysOutputs<T>
   constexpr int W = kWidth<T>;
   const Ray<T> ray = make_ray(a, scratch);
   const int64_t chunk = a.values ? kChunk : ray.size;
+  const ExpScale<T> s = exp_scale(a.inv_s);
   for (int64_t index = begin; index < end; ++index) {
     T* weights = out.weights + index * ray.num_samples;
+    T* weight = ray.whole ? weights : ray.weight;
     const T* values = a.values + index * ray.num_samples * a.channels;
-    const Ahead<T> ahead = look_ahead(a, index, end, (const T*)weights);
-    Transmittance<T> transmittance;
+    Ahead<T> ahead = look_ahead(a, index, end, (const T*)weights, 3);
+    double transmittance = 1;
     read_distances(a, index, ray);
     for (int64_t c = 0; a.values && c < a.channels + kBlock; ++c) ray.channels[c] = T(0);
     for (int64_t first = 0; first < ray.num_samples; first += chunk) {
       const int64_t left = ray.num_samples - first, count = left < chunk ? left : chunk;
-      weigh<false>(a, ray, first, first + padded(count), ahead, transmittance);
-      if (a.values) render_channels<W>(ray.weight + first, values + first * a.channels, count, a.channels, ray.channels);
+      weigh(s, a.last_opaque, ray, first, first + padded(count), ahead, transmittance, weight);
+      if (a.values) render_channels<W>(weight + first, values + first * a.channels, count, a.channels, ray.channels);
     }
-    copy_row(ray.weight, weights, ray.num_samples);
-    place(a, index, ray);
+    if (!ray.whole) copy_row(weight, weights, ray.num_samples);
+    const T* position = positions(a, index, ray);
     Vec<T, W> depth{}, opacity{};
     for (int64_t i = 0; i < ray.size; i += W) {
-      const Vec<T, W> weight = load<W>(ray.weight + i);
-      depth += weight * load<W>(ray.position + i);
-      opacity += weight;
+      depth += load<W>(weight + i) * load<W>(position + i);
+      opacity += load<W>(weight + i);
     }
     out.depth[index] = sum<T, W>(depth);
     out.opacity[index] = sum<T, W>(opacity);
+    out.remaining[index] = T(transmittance);
     if (a.values) from_blocks<W>(ray.channels, a.channels, out.values + index * a.channels);
   }
 }
@@ -351,107 +362,118 @@ template <typename T>
 static inline void backward_sums(const CompositeRaysArgs<T>& a, const CompositeRaysCotangents<T>& grad, int64_t index,
                                  const Ray<T>& ray) {
   constexpr int W = kWidth<T>;
-  place(a, index, ray);
-  if (grad.weights) {
-    copy_row(grad.weights + index * ray.num_samples, ray.cotangent, ray.num_samples);
+  const Vec<T, W> opacity = splat<W>(grad.opacity ? grad.opacity[index] : T(0));
+  if (grad.depth) {
+    const T* position = positions(a, index, ray);
+    for (int64_t i = 0; i < ray.size; i += W) {
+      store(ray.cotangent + i, opacity + grad.depth[index] * load<W>(position + i));
+    }
   } else {
-    for (int64_t i = 0; i < ray.size; i += W) store(ray.cotangent + i, Vec<T, W>{});
+    for (int64_t i = 0; i < ray.size; i += W) store(ray.cotangent + i, opacity);
   }
-  const T opacity = grad.opacity ? grad.opacity[index] : T(0), depth = grad.depth ? grad.depth[index] : T(0);
-  for (int64_t i = 0; i < ray.size; i += W) {
-    Vec<T, W> total = load<W>(ray.cotangent + i) + opacity;
-    if (grad.depth) total += depth * load<W>(ray.position + i);
-    store(ray.cotangent + i, total);
+  if (grad.weights) {
+    const T* __restrict weights = grad.weights + index * ray.num_samples;
+    for (int64_t i = 0; i < ray.num_samples; ++i) ray.cotangent[i] += weights[i];
   }
 }
 
-// Samples [first, first + count): adds to ray.cotangent what comes through the channels; the gradient of values.
+// Samples [first, first + count): adds to ray.cotangent what comes through the channels, where needed; the gradient of
+// values, where wanted.
 template <typename T>
 static inline void backward_channels(const CompositeRaysArgs<T>& a, const CompositeRaysCotangents<T>& grad,
-                                     int64_t index, const Ray<T>& ray, int64_t first, int64_t count,
-                                     bool need_cotangent, const CompositeRaysGradients<T>& out) {
+                                     int64_t index, const Ray<T>& ray, const T* weight, int64_t first, int64_t count,
+                                     bool need_cotangent, const CompositeRaysGradients<T>& out, Ahead<T>& ahead) {
   const int64_t at = (index * ray.num_samples + first) * a.channels;
-#define PRED_CHANNEL_GRADIENTS(dot, outer)                                                                       \
-  channel_gradients<kWidth<T>, dot, outer>(ray.weight + first, a.values + at, count, a.channels,                 \
+#define PRED_CHANNEL_GRADIENTS(dot, outer)                                                                        \
+  channel_gradients<kWidth<T>, dot, outer>(weight + first, a.values + at, count, a.channels,                      \
                                            grad.values + index * a.channels, ray.channels, ray.cotangent + first, \
-                                           out.values + at, ray.buffer, out.stream_values)
-  if (need_cotangent && out.values) PRED_CHANNEL_GRADIENTS(true, true);
-  else if (need_cotangent) PRED_CHANNEL_GRADIENTS(true, false);
-  else if (out.values) PRED_CHANNEL_GRADIENTS(false, true);
+                                           out.values + at, ray.buffer, out.stream_values, ahead)
+  if (need_cotangent && out.values)
+    PRED_CHANNEL_GRADIENTS(true, true);
+  else if (need_cotangent)
+    PRED_CHANNEL_GRADIENTS(true, false);
+  else if (out.values)
+    PRED_CHANNEL_GRADIENTS(false, true);
 #undef PRED_CHANNEL_GRADIENTS
 }
 
-// From ray.cotangent to ray.slope, the gradient of inv_s * sdf. Returns sum(slope * sdf), the gradient of inv_s.
+// From ray.cotangent to the gradient of sdf. Returns the gradient of inv_s.
 template <typename T>
-static inline T backward_distances(const Ray<T>& ray) {
+static inline T backward_distances(const Ray<T>& ray, T inv_s, const T* weight, T remaining, T* grad_sdf) {
   constexpr int W = kWidth<T>;
   using V = Vec<T, W>;
-  V carry{}, total{};
+  // Sums over what lies behind, of weights and of weights times cotangents. Transmittance is the former and what
+  // remains: a sum of positive numbers, as exact where next to nothing is left as where all is.
+  V transmittance_behind = splat<W>(remaining), gain_behind{}, total{};
   for (int64_t i = ray.size - W; i >= 0; i -= W) {
     const V sdf = load<W>(ray.sdf + i);
     const V cotangent = load<W>(ray.cotangent + i), cotangent_before = load<W>(ray.cotangent + i - 1);
-    const V transmittance = load<W>(ray.transmittance + i), transmittance_after = load<W>(ray.transmittance + i + 1);
-    const V sums = suffix_sum<T, W>(load<W>(ray.weight + i) * cotangent);
-    const V from_here = carry + sums, behind = carry + shift_down<1, T, W>(sums, V{});
-    carry += broadcast<0, T, W>(sums);
+    const V weights = suffix_sum<T, W>(load<W>(weight + i)), gains = suffix_sum<T, W>(load<W>(weight + i) * cotangent);
+    const V transmittance = transmittance_behind + weights;
+    const V transmittance_after = transmittance_behind + shift_down<1, T, W>(weights, V{});
     const auto falls_before = load<W>(ray.sdf + i - 1) > sdf, falls_after = sdf > load<W>(ray.sdf + i + 1);
     // H_i and H_{i-1}; S_{i-1} is the sum from here on.
-    const V after = falls_after ? transmittance_after * cotangent - behind : V{};
-    const V before = falls_before ? transmittance * cotangent_before - from_here : V{};
+    const V after = transmittance_after * cotangent - (gain_behind + shift_down<1, T, W>(gains, V{}));
+    const V before = transmittance * cotangent_before - (gain_behind + gains);
     const V both = transmittance * (cotangent - cotangent_before);
-    const V slope = load<W>(ray.occupied + i) * ((falls_before & falls_after) ? both : after - before);
-    store(ray.slope + i, slope);
+    const V one = (falls_after ? after : V{}) - (falls_before ? before : V{});
+    const V slope = load<W>(ray.occupied + i) * ((falls_before & falls_after) ? both : one);  // of inv_s * sdf
+    store(grad_sdf + i, inv_s * slope);
     total += slope * sdf;
+    transmittance_behind += broadcast<0, T, W>(weights);
+    gain_behind += broadcast<0, T, W>(gains);
   }
   return sum<T, W>(total);
 }
 
 template <typename T>
-static inline void backward_positions(const CompositeRaysArgs<T>& a, T grad_depth, const Ray<T>& ray,
+static inline void backward_positions(bool depth_mid, T grad_depth, const T* __restrict weight, int64_t num_samples,
                                       T* __restrict grad_t) {
-  const T* __restrict weight = ray.weight;
-  const int64_t last = ray.num_samples - 1;
-  if (!a.depth_mid) {
-    for (int64_t i = 0; i <= last; ++i) grad_t[i] = grad_depth * weight[i];
-    return;
-  }
-  // Sample i ends section i - 1 and starts section i; the last sample counts at itself. weight[-1] = 0.
-  for (int64_t i = 0; i < last; ++i) grad_t[i] = T(0.5) * grad_depth * (weight[i - 1] + weight[i]);
-  grad_t[last] = grad_depth * (T(0.5) * weight[last - 1] + weight[last]);
+  for (int64_t i = 0; i < num_samples; ++i) grad_t[i] = grad_depth * weight[i];
+  if (!depth_mid) return;
+  // Sample i ends section i - 1 and starts section i; the last sample counts at itself.
+  const int64_t last = num_samples - 1;
+  for (int64_t i = 0; i < last; ++i) grad_t[i] *= T(0.5);
+  for (int64_t i = 1; i <= last; ++i) grad_t[i] += T(0.5) * grad_depth * weight[i - 1];
 }
 
 template <typename T>
-static void backward(const CompositeRaysArgs<T>& a, const CompositeRaysCotangents<T>& grad, const T* weights,
-                     const CompositeRaysGradients<T>& out, T* scratch, int64_t begin, int64_t end) {
+static void backward(const CompositeRaysArgs<T>& a, const CompositeRaysSaved<T>& saved,
+                     const CompositeRaysCotangents<T>& grad, const CompositeRaysGradients<T>& out, T* scratch,
+                     int64_t begin, int64_t end) {
   constexpr int W = kWidth<T>;
   const Ray<T> ray = make_ray(a, scratch);
   const bool need_cotangent = out.sdf || out.inv_s;
   const int64_t chunk = grad.values ? kChunk : ray.size;
+  const ExpScale<T> s = exp_scale(a.inv_s);
   for (int64_t index = begin; index < end; ++index) {
-    const Ahead<T> ahead = look_ahead(a, index, end, (out.sdf ? out.sdf : a.sdf) + index * ray.num_samples);
-    Transmittance<T> transmittance;
+    const int64_t at = index * ray.num_samples;
+    Ahead<T> ahead = look_ahead(a, index, end, (out.sdf ? out.sdf : a.sdf) + at, 2);
+    const T* weight = saved.weights + at;
+    if (!ray.whole) {
+      copy_row(weight, ray.weight, ray.num_samples);
+      weight = ray.weight;
+    }
     if (need_cotangent) {
       read_distances(a, index, ray);
-      ray.occupied[0] = phi(a.inv_s, ray.sdf[0]).occupied;
       backward_sums(a, grad, index, ray);
-    } else {
-      copy_row(weights + index * ray.num_samples, ray.weight, ray.num_samples);
     }
     if (grad.values) to_blocks<W>(grad.values + index * a.channels, a.channels, ray.channels);
     for (int64_t first = 0; first < ray.num_samples; first += chunk) {
       const int64_t left = ray.num_samples - first, count = left < chunk ? left : chunk;
-      if (need_cotangent) weigh<true>(a, ray, first, first + padded(count), ahead, transmittance);
-      if (grad.values) backward_channels(a, grad, index, ray, first, count, need_cotangent, out);
+      for (int64_t i = first; need_cotangent && i < first + padded(count); i += W) {
+        ahead.fetch_rows(i);
+        ahead.fetch_values();
+        store(ray.occupied + i, phi(s, load<W>(ray.sdf + i)).occupied);
+      }
+      if (grad.values) backward_channels(a, grad, index, ray, weight, first, count, need_cotangent, out, ahead);
     }
-    if (out.t) backward_positions(a, grad.depth[index], ray, out.t + index * ray.num_samples);
+    if (out.t) backward_positions(a.depth_mid, grad.depth[index], weight, ray.num_samples, out.t + at);
     if (!need_cotangent) continue;
-    ray.transmittance[ray.size] = T(transmittance.carry[0]);
-    const T grad_inv_s = backward_distances(ray);
+    T* grad_sdf = ray.whole && out.sdf ? out.sdf + at : ray.slope;
+    const T grad_inv_s = backward_distances(ray, a.inv_s, weight, saved.remaining[index], grad_sdf);
     if (out.inv_s) out.inv_s[index] = double(grad_inv_s);
-    if (out.sdf) {
-      T* __restrict grad_sdf = out.sdf + index * ray.num_samples;
-      for (int64_t i = 0; i < ray.num_samples; ++i) grad_sdf[i] = a.inv_s * ray.slope[i];
-    }
+    if (out.sdf && !ray.whole) copy_row(grad_sdf, out.sdf + at, ray.num_samples);
   }
   if (out.stream_values) fence_stream();
 }

@@ -15,8 +15,10 @@ namespace {
 
 template <typename T>
 const ResampleRaysKernels<T>& kernels() {
-  if constexpr (std::is_same_v<T, float>) return PRED_KERNELS(resample_rays_f32);
-  else return PRED_KERNELS(resample_rays_f64);
+  if constexpr (std::is_same_v<T, float>)
+    return PRED_KERNELS(resample_rays_f32);
+  else
+    return PRED_KERNELS(resample_rays_f64);
 }
 
 Tensor resample_rays(const Tensor& t_in, const Tensor& weights_in, const Tensor& u_in) {
@@ -33,17 +35,19 @@ Tensor resample_rays(const Tensor& t_in, const Tensor& weights_in, const Tensor&
                ": weights must have one row per ray of ", samples, " or ", samples - 1, " weights, got ",
                shape_text(weights_in));
     PRED_CHECK(u_in.dim() == 1 || u_in.size(0) == rays, op, ": u must have one row per ray, got ", shape_text(u_in));
-    PRED_CHECK(new_samples < (int64_t(1) << 30), op, ": u must have fewer than 2^30 samples per ray, got ", new_samples);
+    PRED_CHECK(new_samples < (int64_t(1) << 30), op, ": u must have fewer than 2^30 samples per ray, got ",
+               new_samples);
     const Tensor t = torch::stable::contiguous(t_in), weights = torch::stable::contiguous(weights_in);
     const Tensor u = torch::stable::contiguous(u_in);
-    const ResampleRaysArgs<T> a{t.const_data_ptr<T>(), weights.const_data_ptr<T>(), u.const_data_ptr<T>(), samples,
-                                num_weights, new_samples, u.dim() == 1 ? 0 : new_samples};
+    const ResampleRaysArgs<T> a{
+        t.const_data_ptr<T>(), weights.const_data_ptr<T>(),   u.const_data_ptr<T>(), samples, num_weights,
+        new_samples,           u.dim() == 1 ? 0 : new_samples};
     Tensor merged = torch::stable::new_empty(t, {rays, samples + new_samples});
     T* out = merged.mutable_data_ptr<T>();
     const auto& k = kernels<T>();
     parallel(rays, 1 + 32768 / (samples + new_samples), [&](int64_t begin, int64_t end) {
       std::vector<T> scratch(k.scratch_size(a));
-      std::vector<int32_t> int_scratch(samples);
+      std::vector<int32_t> int_scratch(samples + 16);
       k.resample(a, out, scratch.data(), int_scratch.data(), begin, end);
     });
     return merged;

@@ -25,9 +25,8 @@ struct ResampleRaysArgs {
 template <typename T>
 struct ResampleRaysKernels {
   int64_t (*scratch_size)(const ResampleRaysArgs<T>&);  // in elements, for one range
-  // merged [R, S + num_new]; int_scratch [S]
-  void (*resample)(const ResampleRaysArgs<T>&, T* merged, T* scratch, int32_t* int_scratch, int64_t begin,
-                   int64_t end);
+  // merged [R, S + num_new]; int_scratch [S + 16]
+  void (*resample)(const ResampleRaysArgs<T>&, T* merged, T* scratch, int32_t* int_scratch, int64_t begin, int64_t end);
 };
 
 }  // namespace pred

@@ -6,14 +6,15 @@
 // A section's samples are written as whole vectors, of which the surplus lanes are overwritten by the sections that
 // follow; the row is assembled in scratch, so that no surplus leaves it. Rays whose t or u are out of order or not
 // finite take the slow path: search, then sort.
-#include "ops/resample_rays.h"
-
 #include "math/lanes.h"
+#include "ops/resample_rays.h"
 
 namespace pred::PRED_ISA {
 namespace {
 
 constexpr int64_t kPad = 16;  // at least a vector, on both sides of every row
+
+static inline int64_t padded(int64_t n) { return (n + kPad - 1) / kPad * kPad; }
 
 // `narrowest`: a section less probable counts as empty, so that slopes stay finite.
 template <typename T>
@@ -29,24 +30,27 @@ struct Limits<double> {
   static constexpr double narrowest = 1e-300;
 };
 
-// Scratch rows of one ray. `u` has room for a vector on both sides.
+// Scratch rows of one ray, with room for a vector on both sides. Sections are padded to whole vectors, by empty ones
+// at the end.
 template <typename T>
 struct Row {
-  T *mass, *cdf, *slope, *u, *merged;
-  int32_t* end;  // [S - 1] c_{i+1}
+  int64_t sections, size;  // size: padded
+  T *t, *mass, *cdf, *slope, *u, *merged;
+  int32_t* end;  // [size] c_{i+1}
 };
 
 template <typename T>
 static int64_t scratch_size(const ResampleRaysArgs<T>& a) {
-  return 4 * (a.num_samples + 2 * kPad) + 2 * (a.num_new + 2 * kPad);
+  return 5 * (padded(a.num_samples) + 2 * kPad) + 2 * (a.num_new + 2 * kPad);
 }
 
 template <typename T>
 static Row<T> make_row(const ResampleRaysArgs<T>& a, T* scratch, int32_t* int_scratch) {
-  const int64_t stride = a.num_samples + 2 * kPad;
+  const int64_t sections = a.num_samples - 1, size = padded(sections), stride = size + 2 * kPad;
   T* first = scratch + kPad;
-  T* u = first + 3 * stride;
-  return {first, first + stride, first + 2 * stride, u, u + a.num_new + kPad, int_scratch};
+  T* u = first + 4 * stride;
+  return {sections,   size, first, first + stride, first + 2 * stride, first + 3 * stride, u, u + a.num_new + kPad,
+          int_scratch};
 }
 
 template <typename T>
@@ -59,46 +63,50 @@ static inline bool ascending(const T* x, int64_t n) {
 // cumulative[i] = sum of mass[0..i), for i in [0, n]; summed in double.
 template <typename T>
 static inline void accumulate(const T* mass, int64_t n, T* cumulative) {
-  constexpr int W = kWidth<double>;
-  using Wide = Vec<double, W>;
-  Wide carry{};
+  constexpr int D = kWidth<double>;
+  Vec<double, D> before{};
   cumulative[0] = T(0);
-  for (int64_t i = 0; i < n; i += W) {
-    const Wide sums = carry + prefix_sum<double, W>(__builtin_convertvector(load<W>(mass + i), Wide));
-    using Out = Vec<T, W>;
-    store(cumulative + i + 1, __builtin_convertvector(sums, Out));
-    carry = broadcast<W - 1, double, W>(sums);
+  for (int64_t i = 0; i < n; i += D) {
+    const Vec<double, D> sums = prefix_sum<double, D>(load_wide(mass + i));
+    store_narrow(cumulative + i + 1, before + sums);
+    before += broadcast<D - 1, double, D>(sums);
   }
+}
+
+template <typename T>
+static inline void read_ranges(const T* __restrict t, const Row<T>& row) {
+  for (int64_t i = 0; i <= row.sections; ++i) row.t[i] = t[i];
+  for (int64_t i = row.sections + 1; i <= row.size; ++i) row.t[i] = t[row.sections];
 }
 
 // The cumulative distribution over sections, from 0 to exactly 1. False where there is none: a range is not finite.
 template <typename T>
-static inline bool distribution(const T* __restrict t, const T* __restrict weights, int64_t num_samples,
-                                const Row<T>& row) {
-  const int64_t sections = num_samples - 1;
+static inline bool distribution(const T* __restrict weights, const Row<T>& row) {
+  const T* __restrict t = row.t;
   T* __restrict mass = row.mass;
   T* __restrict cdf = row.cdf;
-  for (int64_t i = 0; i < sections; ++i) mass[i] = weights[i] <= T(0) ? T(0) : weights[i];
-  for (int64_t i = sections; i < sections + kPad; ++i) mass[i] = T(0);
-  accumulate(mass, sections, cdf);
-  T total = cdf[sections];
+  for (int64_t i = 0; i < row.sections; ++i) mass[i] = weights[i] <= T(0) ? T(0) : weights[i];
+  for (int64_t i = row.sections; i < row.size; ++i) mass[i] = T(0);
+  accumulate(mass, row.size, cdf);
+  T total = cdf[row.size];
   if (!(total >= Limits<T>::smallest && total <= Limits<T>::largest)) {
-    for (int64_t i = 0; i < sections; ++i) mass[i] = t[i + 1] - t[i] <= T(0) ? T(0) : t[i + 1] - t[i];
-    accumulate(mass, sections, cdf);
-    total = cdf[sections];
+    for (int64_t i = 0; i < row.size; ++i) mass[i] = t[i + 1] - t[i] <= T(0) ? T(0) : t[i + 1] - t[i];
+    accumulate(mass, row.size, cdf);
+    total = cdf[row.size];
     if (!(total <= Limits<T>::largest)) return false;
     if (total == T(0)) {  // all t are equal: any section will do
-      cdf[sections] = T(1);
+      for (int64_t i = row.sections; i <= row.size; ++i) cdf[i] = T(1);
       return true;
     }
   }
-  for (int64_t i = 0; i <= sections; ++i) cdf[i] = cdf[i] / total;
+  for (int64_t i = 0; i < row.size; ++i) cdf[i] = cdf[i] / total;
+  cdf[row.size] = T(1);
   return true;
 }
 
 // How a row of u lies.
 enum class Spread {
-  kEven,       // u_k is in [k, k + 1] / n: midpoints, stratified
+  kEven,  // u_k is in [k, k + 1] / n: midpoints, stratified
   kAscending,
   kOther,
 };
@@ -124,35 +132,35 @@ static inline Spread read_positions(const T* __restrict from, int64_t n, T* __re
 
 // row.end[i] = c_{i+1}, the number of samples with u < cdf_{i+1}. Never falls, and ends with num_new.
 template <typename T>
-static inline void section_ends(Spread spread, int64_t sections, int64_t num_new, const Row<T>& row) {
+static inline void section_ends(Spread spread, int64_t num_new, const Row<T>& row) {
   const T *u = row.u, *cdf = row.cdf;
   if (spread == Spread::kEven) {
     // All u before the place of cdf_{i+1} are below it and all after it are not, up to rounding; a sample that rounding
     // puts into the neighbouring section is clipped to the end they share.
-    for (int64_t i = 0; i < sections; ++i) {
+    for (int64_t i = 0; i < row.size; ++i) {
       const int32_t place = int32_t(cdf[i + 1] * T(num_new));
       row.end[i] = place + (u[place] < cdf[i + 1] ? 1 : 0);
     }
     return;
   }
   int32_t end = 0;
-  for (int64_t i = 0; i < sections; ++i) {
+  for (int64_t i = 0; i < row.sections; ++i) {
     while (u[end] < cdf[i + 1]) ++end;
     row.end[i] = end;
   }
 }
 
 template <typename T>
-static inline void merge(const T* t, int64_t sections, int64_t num_new, const Row<T>& row) {
+static inline void merge(int64_t num_new, const Row<T>& row) {
   constexpr int W = kWidth<T>;
-  const T *u = row.u, *cdf = row.cdf;
+  const T *t = row.t, *u = row.u, *cdf = row.cdf;
   T* __restrict slope = row.slope;
-  for (int64_t i = 0; i < sections; ++i) {
+  for (int64_t i = 0; i < row.size; ++i) {
     const T width = cdf[i + 1] - cdf[i];
     slope[i] = width >= Limits<T>::narrowest ? (t[i + 1] - t[i]) / width : T(0);
   }
   int64_t begin = 0;  // c_i
-  for (int64_t i = 0; i < sections; ++i) {
+  for (int64_t i = 0; i < row.sections; ++i) {
     const int64_t end = row.end[i];
     T* out = row.merged + i + 1;
     // Lane 0 of the first vector is u[begin - 1] < cdf_i, which becomes t_i itself.
@@ -164,7 +172,7 @@ static inline void merge(const T* t, int64_t sections, int64_t num_new, const Ro
     }
     begin = end;
   }
-  row.merged[sections + num_new] = t[sections];
+  row.merged[row.sections + num_new] = t[row.sections];
 }
 
 template <typename T>
@@ -195,12 +203,13 @@ static void sort(T* x, int64_t n) {
 }
 
 template <typename T>
-static void merge_any(const T* t, int64_t num_samples, int64_t num_new, bool has_cdf, const Row<T>& row) {
-  const T* cdf = row.cdf;
+static void merge_any(int64_t num_new, bool has_cdf, const Row<T>& row) {
+  const T *t = row.t, *cdf = row.cdf;
+  const int64_t num_samples = row.sections + 1;
   for (int64_t i = 0; i < num_samples; ++i) row.merged[i] = t[i];
   for (int64_t k = 0; k < num_new; ++k) {
     const T u = row.u[k];
-    int64_t low = 0, high = num_samples - 1;  // the section is in [low, high)
+    int64_t low = 0, high = row.sections;  // the section is in [low, high)
     while (high - low > 1) {
       const int64_t middle = low + (high - low) / 2;
       (cdf[middle] <= u ? low : high) = middle;
@@ -213,21 +222,32 @@ static void merge_any(const T* t, int64_t num_samples, int64_t num_new, bool has
 }
 
 template <typename T>
+static inline void prefetch(const T* row, int64_t n) {
+  for (int64_t i = 0; i < n; i += 64 / int64_t(sizeof(T))) __builtin_prefetch(row + i);
+}
+
+template <typename T>
 static void resample(const ResampleRaysArgs<T>& a, T* merged, T* scratch, int32_t* int_scratch, int64_t begin,
                      int64_t end) {
   const Row<T> row = make_row(a, scratch, int_scratch);
-  const int64_t last = a.num_samples - 1, out_size = a.num_samples + a.num_new;
+  const int64_t out_size = a.num_samples + a.num_new;
   Spread spread = Spread::kOther;
   for (int64_t ray = begin; ray < end; ++ray) {
     if (a.u_stride != 0 || ray == begin) spread = read_positions(a.u + ray * a.u_stride, a.num_new, row.u);
-    const T* t = a.t + ray * a.num_samples;
-    const bool has_cdf = distribution(t, a.weights + ray * a.weight_stride, a.num_samples, row);
-    const bool t_ascends = ascending(t, a.num_samples) && t[0] >= -Limits<T>::largest && t[last] <= Limits<T>::largest;
-    if (has_cdf && t_ascends && spread != Spread::kOther) {
-      section_ends(spread, last, a.num_new, row);
-      merge(t, last, a.num_new, row);
+    if (ray + 1 < end) {
+      prefetch(a.t + (ray + 1) * a.num_samples, a.num_samples);
+      prefetch(a.weights + (ray + 1) * a.weight_stride, a.weight_stride);
+      prefetch(a.u + (ray + 1) * a.u_stride, a.u_stride);
+    }
+    read_ranges(a.t + ray * a.num_samples, row);
+    const bool has_cdf = distribution(a.weights + ray * a.weight_stride, row);
+    const bool in_order = ascending(row.t, row.size + 1) && row.t[0] >= -Limits<T>::largest &&
+                          row.t[row.size] <= Limits<T>::largest && spread != Spread::kOther;
+    if (has_cdf && in_order) {
+      section_ends(spread, a.num_new, row);
+      merge(a.num_new, row);
     } else {
-      merge_any(t, a.num_samples, a.num_new, has_cdf, row);
+      merge_any(a.num_new, has_cdf, row);
     }
     T* __restrict out = merged + ray * out_size;
     const T* __restrict from = row.merged;

@@ -16,8 +16,10 @@ namespace {
 
 template <typename T>
 const SdfToAlphaKernels<T>& kernels() {
-  if constexpr (std::is_same_v<T, float>) return PRED_KERNELS(sdf_to_alpha_f32);
-  else return PRED_KERNELS(sdf_to_alpha_f64);
+  if constexpr (std::is_same_v<T, float>)
+    return PRED_KERNELS(sdf_to_alpha_f32);
+  else
+    return PRED_KERNELS(sdf_to_alpha_f64);
 }
 
 // Rays per task, such that a task takes some 50 microseconds.

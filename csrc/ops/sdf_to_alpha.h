@@ -26,8 +26,8 @@ template <typename T>
 struct SdfToAlphaKernels {
   void (*forward)(const SdfToAlphaArgs<T>&, T* alpha, int64_t begin, int64_t end);
   // grad, grad_sdf [R, S]; grad_inv_s [R] holds each ray's part; scratch [3, S]. Either output may be null.
-  void (*backward)(const SdfToAlphaArgs<T>&, const T* grad, T* grad_sdf, double* grad_inv_s, T* scratch,
-                   int64_t begin, int64_t end);
+  void (*backward)(const SdfToAlphaArgs<T>&, const T* grad, T* grad_sdf, double* grad_inv_s, T* scratch, int64_t begin,
+                   int64_t end);
 };
 
 }  // namespace pred

@@ -10,12 +10,12 @@ namespace {
 template <typename T>
 static void forward(const SdfToAlphaArgs<T>& a, T* alpha, int64_t begin, int64_t end) {
   const int64_t last = a.num_samples - 1;
-  const T inv_s = a.inv_s;
+  const ExpScale<T> s = exp_scale(a.inv_s);
   for (int64_t ray = begin; ray < end; ++ray) {
     const T* __restrict sdf = a.sdf + ray * a.num_samples;
     T* __restrict out = alpha + ray * a.num_samples;
     for (int64_t i = 0; i < last; ++i) {
-      out[i] = pair_alpha(inv_s, sdf[i], sdf[i + 1], phi(inv_s, sdf[i + 1])).alpha;
+      out[i] = pair_alpha(s, sdf[i], sdf[i + 1], phi(s, sdf[i + 1])).alpha;
     }
     out[last] = a.last_opaque ? T(1) : T(0);
   }
@@ -26,16 +26,17 @@ static void backward(const SdfToAlphaArgs<T>& a, const T* grad, T* grad_sdf, dou
                      int64_t begin, int64_t end) {
   const int64_t last = a.num_samples - 1;
   const T inv_s = a.inv_s;
-  T* __restrict here = scratch;                          // gradient of s d_i through alpha_i
-  T* __restrict before = scratch + a.num_samples;        // and through alpha_{i-1}
-  T* __restrict scale = scratch + 2 * a.num_samples;     // gradient of s through alpha_i
+  const ExpScale<T> s = exp_scale(a.inv_s);
+  T* __restrict here = scratch;                       // gradient of s d_i through alpha_i
+  T* __restrict before = scratch + a.num_samples;     // and through alpha_{i-1}
+  T* __restrict scale = scratch + 2 * a.num_samples;  // gradient of s through alpha_i
   for (int64_t ray = begin; ray < end; ++ray) {
     const T* __restrict sdf = a.sdf + ray * a.num_samples;
     const T* __restrict row = grad + ray * a.num_samples;
     before[0] = here[last] = T(0);
     for (int64_t i = 0; i < last; ++i) {
-      const Phi<T> next = phi(inv_s, sdf[i + 1]);
-      const PairAlpha<T> pair = pair_alpha(inv_s, sdf[i], sdf[i + 1], next);
+      const Phi<T> next = phi(s, sdf[i + 1]);
+      const PairAlpha<T> pair = pair_alpha(s, sdf[i], sdf[i + 1], next);
       const T slope = sdf[i] > sdf[i + 1] ? row[i] * next.occupied : T(0);
       here[i] = slope * pair.decay;
       before[i + 1] = -slope * pair.passed;

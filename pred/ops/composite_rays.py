@@ -75,7 +75,7 @@ def composite_rays(
         sdf = sdf.detach()
         inv_s = inv_s.detach() if detach_inv_s else inv_s
     if _native.use_native(op, sdf):
-        weights, depth, opacity, rendered = torch.ops.pred.composite_rays(
+        weights, depth, opacity, rendered, _ = torch.ops.pred.composite_rays(
             sdf, inv_s, t, values, depth_at == "mid", last == "opaque"
         )
         out = Composite(weights, depth, opacity, None if values is None else rendered)
@@ -143,20 +143,19 @@ def _arguments(
 
 def _fake(
     sdf: Tensor, inv_s: Tensor, t: Tensor, values: Tensor | None, depth_mid: bool, last_opaque: bool
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     rays = sdf.shape[0]
     rendered = sdf.new_empty(0) if values is None else sdf.new_empty(rays, values.shape[2])
-    return sdf.new_empty(sdf.shape), sdf.new_empty(rays), sdf.new_empty(rays), rendered
+    return sdf.new_empty(sdf.shape), sdf.new_empty(rays), sdf.new_empty(rays), rendered, sdf.new_empty(rays)
 
 
 def _save(ctx: Any, inputs: Any, output: Any) -> None:
     sdf, inv_s, t, values, ctx.depth_mid, ctx.last_opaque = inputs
-    ctx.has_values = values is not None
+    weights, _, _, rendered, remaining = output
     ctx.set_materialize_grads(False)
-    if ctx.needs_input_grad[0] or ctx.needs_input_grad[1]:
-        ctx.save_for_backward(sdf, inv_s, t, values, None)  # the weights are computed again
-    else:
-        ctx.save_for_backward(sdf, inv_s, t, None, output[0])
+    ctx.mark_non_differentiable(remaining, *([rendered] if values is None else []))
+    distances = ctx.needs_input_grad[0] or ctx.needs_input_grad[1]
+    ctx.save_for_backward(sdf, inv_s, t, values if distances else None, weights, remaining)
 
 
 def _backward(
@@ -165,17 +164,14 @@ def _backward(
     grad_depth: Tensor | None,
     grad_opacity: Tensor | None,
     grad_values: Tensor | None,
+    _: Tensor | None,
 ) -> tuple[Tensor | None, ...]:
-    sdf, inv_s, t, values, weights = ctx.saved_tensors
     need_sdf, need_inv_s, need_t, need_values = ctx.needs_input_grad[:4]
-    grad_values = grad_values if ctx.has_values else None  # without values that output is a mere placeholder
     grads = (grad_weights, grad_depth, grad_opacity, grad_values)
     if all(grad is None for grad in grads):
         return (None,) * 6
     needs = (need_sdf, need_inv_s, need_t and grad_depth is not None, need_values and grad_values is not None)
-    out = torch.ops.pred.composite_rays_backward(
-        *grads, sdf, inv_s, t, values, weights, ctx.depth_mid, ctx.last_opaque, *needs
-    )
+    out = torch.ops.pred.composite_rays_backward(*grads, *ctx.saved_tensors, ctx.depth_mid, ctx.last_opaque, *needs)
     return *(grad if need else None for grad, need in zip(out, needs, strict=True)), None, None
 
 
@@ -188,7 +184,8 @@ def _fake_backward(
     inv_s: Tensor,
     t: Tensor,
     values: Tensor | None,
-    weights: Tensor | None,
+    weights: Tensor,
+    remaining: Tensor,
     depth_mid: bool,
     last_opaque: bool,
     need_sdf: bool,
@@ -205,6 +202,5 @@ def _fake_backward(
     )
 
 
-if _native.available():
-    _native.register("composite_rays", fake=_fake, setup_context=_save, backward=_backward)
-    _native.register("composite_rays_backward", fake=_fake_backward)
+_native.register("composite_rays", fake=_fake, setup_context=_save, backward=_backward)
+_native.register("composite_rays_backward", fake=_fake_backward)

@@ -200,8 +200,13 @@ def test_opcheck(native: None, num_rays: int) -> None:
     torch.library.opcheck(torch.ops.pred.composite_rays.default, (sdf, inv_s, t, None, True, True))
     plain = [tensor.detach() for tensor in (sdf, inv_s, t, values)]
     grads = [torch.randn(num_rays, 9), torch.randn(num_rays), torch.randn(num_rays), torch.randn(num_rays, 3)]
+    weights, _, _, _, remaining = torch.ops.pred.composite_rays(*plain, False, False)
+    backward = torch.ops.pred.composite_rays_backward.default
+    for needs in [(True, True, True, True), (False, False, False, True)]:
+        torch.library.opcheck(backward, (*grads, *plain, weights, remaining, False, False, *needs))
+    of_depth = (None, grads[1], None, None)
     torch.library.opcheck(
-        torch.ops.pred.composite_rays_backward.default, (*grads, *plain, None, False, False, True, True, True, True)
+        backward, (*of_depth, *plain[:3], None, weights, remaining, True, True, True, False, True, False)
     )
 
 
