@@ -3,7 +3,7 @@
 """`pred view RUN`: pictures of what a run renders, one per camera and one from above.
 
 The network sees the 5 % of the fixed mask that `pred evaluate` uses too. Rendered colours fade to grey where a ray sees
-little (low opacity).
+little (low opacity), and they are dimmed far from every LiDAR return: there, nothing taught the network what to render.
 """
 
 from __future__ import annotations
@@ -123,6 +123,11 @@ def camera_picture(
 
     size = (640, round(640 * camera.height / camera.width))
     image = Image.fromarray(camera.load_image()).resize(size) if camera.image is not None else blank(size, "no image")
+    points = frame.points[frame.is_keyframe & inside_range(frame.points, config.point_range), :3]
+    uv, z_depth_m = camera.project(points)
+    seen = camera.in_image(uv, z_depth_m)
+    taught = near_cells(uv[seen] * (columns / camera.width, rows / camera.height), (rows, columns), columns // 40)
+
     if camera.labels is None:
         label = blank(size, "no pseudo label")
         semantics, classes = blank(size, "not trained: no pseudo labels"), np.zeros(0, dtype=np.int64)
@@ -130,10 +135,11 @@ def camera_picture(
         label_map = camera.labels.class_map()
         label = enlarge(class_colours(label_map), size)
         rendered_map = rendered.semantics[0].argmax(-1).reshape(rows, columns).cpu().numpy()
-        semantics = enlarge(faded(CLASS_COLOURS[rendered_map], opacity), size)
-        classes = np.union1d(label_map[label_map < len(CLASS_NAMES)], rendered_map[opacity > 0.5])
-    distance = enlarge(faded(distance_colours(distance_m), opacity), size)
-    draw_lidar_points(distance, frame, camera, config)
+        semantics = enlarge(dimmed(faded(CLASS_COLOURS[rendered_map], opacity), taught), size)
+        classes = np.union1d(label_map[label_map < len(CLASS_NAMES)], rendered_map[taught & (opacity > 0.5)])
+    distance = enlarge(dimmed(faded(distance_colours(distance_m), opacity), taught), size)
+    distance_of_points_m = np.linalg.norm(points[seen] - camera.T_lidar_from_camera[:3, 3], axis=1)
+    draw_points(distance, uv[seen] * (size[0] / camera.width), distance_colours(distance_of_points_m))
 
     return page(
         f"{camera.name}   {frame.token}",
@@ -142,6 +148,7 @@ def camera_picture(
             [("rendered semantics", semantics), ("rendered distance, LiDAR points on top", distance)],
         ],
         [class_legend(classes), distance_legend()],
+        "dim: far from every LiDAR return",
     )
 
 
@@ -160,22 +167,26 @@ def bev_picture(
     opacity = rendered.opacity[0].reshape(rows, columns).cpu().numpy()
     has_labels = any(camera.labels is not None for camera in frame.cameras)
 
+    cell_m = (x_max - x_min) / columns
+    keyframe = frame.points[frame.is_keyframe, :2]
+    taught = near_cells((keyframe - (x_min, y_max)) / (cell_m, -cell_m), (rows, columns), max(1, round(2.0 / cell_m)))
     size = (512, max(1, round(512 * rows / columns)))
     points = Image.new("RGB", size, BACKGROUND)
-    draw_points_from_above(points, frame.points[:, :3], config, (70, 70, 70))
-    draw_points_from_above(points, visible, config, (255, 220, 90))
+    draw_points_from_above(points, frame.points[:, :3], config, (90, 90, 90))
+    draw_points_from_above(points, visible, config, (255, 210, 70), width=2)
     if has_labels:
         classes = rendered.semantics[0].argmax(-1).reshape(rows, columns).cpu().numpy()
-        top = enlarge(faded(CLASS_COLOURS[classes], opacity), size)
-        legends = [class_legend(np.unique(classes[opacity > 0.5]))]
+        colours = CLASS_COLOURS[classes]
+        legends = [class_legend(np.unique(classes[taught & (opacity > 0.5)]))]
     else:
         height_m = above[0, 2] - rendered.depth_m[0].reshape(rows, columns).cpu().numpy()
         share = ((height_m - z_min) / (z_max - z_min)).clip(0, 1)
-        top = enlarge(faded(np.repeat((share * 255).astype(np.uint8)[..., None], 3, axis=-1), opacity), size)
+        colours = np.repeat((share * 255).astype(np.uint8)[..., None], 3, axis=-1)
         legends = []
+    top = enlarge(dimmed(faded(colours, opacity), taught), size)
     cut_z_m = cut_height(frame, config)
     sdf_m = signed_distance(network, bev, np.column_stack([x_m, y_m, np.full(len(x_m), cut_z_m)]))
-    cut = enlarge(sdf_colours(sdf_m.reshape(rows, columns)), size)
+    cut = enlarge(dimmed(sdf_colours(sdf_m.reshape(rows, columns)), taught), size)
     for panel in (points, top, cut):
         if frame.boxes is not None:
             draw_boxes(panel, frame.boxes, config)
@@ -189,6 +200,7 @@ def bev_picture(
             ]
         ],
         legends,
+        "dim: no LiDAR return within 2 m",
     )
 
 
@@ -270,6 +282,24 @@ def faded(colours: Picture, opacity: NDArray[np.floating]) -> Picture:
     return np.asarray(colours * share + NOTHING * (1 - share), dtype=np.uint8)
 
 
+def dimmed(colours: Picture, taught: NDArray[np.bool_]) -> Picture:
+    """Darker where the network was taught nothing."""
+    return np.where(taught[..., None], colours, (colours * 0.35).astype(np.uint8))
+
+
+def near_cells(cells: NDArray[np.floating], shape: tuple[int, int], radius: int) -> NDArray[np.bool_]:
+    """[rows, columns] mask of the grid cells at most ``radius`` rows and columns from one of N (column, row)."""
+    rows, columns = shape
+    counts = np.zeros((rows + 2 * radius + 1, columns + 2 * radius + 1), dtype=np.int64)
+    column, row = np.floor(cells).astype(np.int64).T
+    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    counts[row[inside] + radius + 1, column[inside] + radius + 1] = 1
+    sums = counts.cumsum(axis=0).cumsum(axis=1)  # box sums by differences of a summed-area table
+    width = 2 * radius + 1
+    boxes = sums[width:, width:] - sums[:-width, width:] - sums[width:, :-width] + sums[:-width, :-width]
+    return boxes > 0
+
+
 def enlarge(picture: Picture, size: tuple[int, int]) -> Image.Image:
     """Resize without mixing colours: they are classes."""
     return Image.fromarray(picture).resize(size, Image.Resampling.NEAREST)
@@ -282,24 +312,25 @@ def blank(size: tuple[int, int], text: str) -> Image.Image:
     return panel
 
 
-def draw_lidar_points(panel: Image.Image, frame: Frame, camera: Camera, config: PretrainConfig) -> None:
-    """Keyframe returns as dots in the colour of their distance from the camera."""
-    points = frame.points[frame.is_keyframe & inside_range(frame.points, config.point_range), :3]
-    uv, z_depth_m = camera.project(points)
-    seen = camera.in_image(uv, z_depth_m)
-    distance_m = np.linalg.norm(points - camera.T_lidar_from_camera[:3, 3], axis=1)
-    scale = panel.width / camera.width
+def draw_points(panel: Image.Image, pixels: NDArray[np.float64], colours: Picture) -> None:
+    """Dots of 3 x 3 at pixels [N, 2] in colours [N, 3]."""
     draw = ImageDraw.Draw(panel)
-    for (x, y), colour in zip(uv[seen] * scale, distance_colours(distance_m[seen]), strict=True):
-        draw.rectangle((x - 1, y - 1, x + 1, y + 1), fill=tuple(colour.tolist()))
+    for (x, y), colour in zip(pixels.tolist(), colours.tolist(), strict=True):
+        draw.rectangle((x - 1, y - 1, x + 1, y + 1), fill=tuple(colour))
 
 
 def draw_points_from_above(
-    panel: Image.Image, points: NDArray[np.float32], config: PretrainConfig, colour: tuple[int, int, int]
+    panel: Image.Image,
+    points: NDArray[np.float32],
+    config: PretrainConfig,
+    colour: tuple[int, int, int],
+    width: int = 1,
 ) -> None:
-    """Points [N, 3] inside the range as single pixels."""
+    """Points [N, 3] inside the range as squares of ``width`` pixels."""
     pixels = pixels_from_above(points[inside_range(points, config.point_range), :2], panel, config)
-    ImageDraw.Draw(panel).point([tuple(pixel) for pixel in pixels.tolist()], fill=colour)
+    draw = ImageDraw.Draw(panel)
+    for x, y in np.floor(pixels).tolist():
+        draw.rectangle((x, y, x + width - 1, y + width - 1), fill=colour)
 
 
 def draw_boxes(panel: Image.Image, boxes: Boxes, config: PretrainConfig) -> None:
@@ -321,14 +352,15 @@ def pixels_from_above(xy_m: NDArray[np.floating], panel: Image.Image, config: Pr
     return np.column_stack([x, y])
 
 
-def page(title: str, rows: list[list[tuple[str, Image.Image]]], legends: list[Image.Image]) -> Image.Image:
-    """Captioned panels in rows, a title above and legends below."""
+def page(title: str, rows: list[list[tuple[str, Image.Image]]], legends: list[Image.Image], note: str) -> Image.Image:
+    """Captioned panels in rows, a title and a note above and legends below."""
     width = max(sum(panel.width + MARGIN for _, panel in row) for row in rows) + MARGIN
     heights = [max(panel.height for _, panel in row) + CAPTION + MARGIN for row in rows]
     height = CAPTION + MARGIN + sum(heights) + sum(legend.height + MARGIN for legend in legends)
     sheet = Image.new("RGB", (width, height), BACKGROUND)
     draw = ImageDraw.Draw(sheet)
     draw.text((MARGIN, MARGIN // 2), title, fill=INK, font=font())
+    draw.text((width - MARGIN, MARGIN // 2), note, fill=INK, font=font(), anchor="ra")
     y = CAPTION + MARGIN
     for row, row_height in zip(rows, heights, strict=True):
         x = MARGIN

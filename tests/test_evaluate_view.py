@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pred import cli
 from pred.data.batch import TrainingBatches, build_source, evaluation_batch
-from pred.data.frame import CLASS_NAMES, Boxes, Camera, Frame
+from pred.data.frame import CLASS_NAMES, Boxes, Frame
 from pred.data.masking import is_held_out
 from pred.data.world import StreetFrames
 from pred.evaluate import Scores, add_scores, error_summary, evaluate_rendering, range_of_nearest_visible, results_table
@@ -27,10 +27,12 @@ from pred.view import (
     FARTHEST_M,
     NEAREST_M,
     class_colours,
+    dimmed,
     distance_colours,
     draw_boxes,
-    draw_lidar_points,
+    draw_points,
     faded,
+    near_cells,
     pixel_rays,
     pixels_from_above,
     sdf_colours,
@@ -227,29 +229,30 @@ def test_pixel_rays_point_at_their_pixels(config: PretrainConfig) -> None:
         assert (z_depth_m > 0).all()
 
 
-def forward_camera() -> Camera:
-    """100 x 50 pixels, looking along +y from the LiDAR's place, 45 degrees to each side."""
-    T_camera_from_lidar = np.eye(4)
-    T_camera_from_lidar[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-    return Camera("CAM", np.array([[50.0, 0, 50], [0, 50, 25], [0, 0, 1]]), T_camera_from_lidar, 100, 50)
-
-
-def frame_of(*points: tuple[float, float, float]) -> Frame:
-    array = np.zeros((len(points), 5), np.float32)
-    array[:, :3] = points
-    return Frame("t", array, np.arange(len(points)), np.ones(len(points), bool))
-
-
-def test_lidar_points_are_drawn_at_their_pixel_in_their_colour(config: PretrainConfig) -> None:
+def test_points_are_drawn_at_their_pixel_in_their_colour() -> None:
     panel = Image.new("RGB", (200, 100))
-    # Right of the middle; left and up; behind the camera; outside of the range box.
-    frame = frame_of((5.0, 10.0, 0.0), (-4.0, 8.0, 2.0), (0.0, -10.0, 0.0), (0.0, 30.0, 0.0))
-    draw_lidar_points(panel, frame, forward_camera(), config)
-    drawn = np.argwhere(np.asarray(panel).any(axis=-1))
-    assert set(map(tuple, drawn.tolist())) == {
-        (v + dv, u + du) for v, u in ((50, 150), (25, 50)) for dv in (-1, 0, 1) for du in (-1, 0, 1)
-    }
-    assert panel.getpixel((150, 50)) == tuple(distance_colours(np.array([math.sqrt(125)]))[0].tolist())
+    draw_points(panel, np.array([[150.0, 50.0], [50.0, 25.0]]), np.array([[255, 0, 0], [0, 255, 0]], np.uint8))
+    picture = np.asarray(panel)
+    assert (picture[49:52, 149:152] == (255, 0, 0)).all() and (picture[24:27, 49:52] == (0, 255, 0)).all()
+    assert np.count_nonzero(picture.any(axis=-1)) == 18
+
+
+def test_cells_near_a_return() -> None:
+    cells = np.array([[0.5, 0.5], [4.9, 2.0], [-1.0, 3.0], [2.0, 9.0]])  # column, row; the last two are outside
+    expected = [[1, 1, 0, 0, 0, 0], [1, 1, 0, 1, 1, 1], [0, 0, 0, 1, 1, 1], [0, 0, 0, 1, 1, 1]]
+    assert near_cells(cells, (4, 6), radius=1).astype(int).tolist() == expected
+    assert near_cells(cells, (4, 6), radius=0).sum() == 2
+    assert not near_cells(np.zeros((0, 2)), (4, 6), radius=3).any()
+    colours = np.full((1, 2, 3), 100, np.uint8)
+    assert dimmed(colours, np.array([[True, False]]))[0, :, 0].tolist() == [100, 35]
+
+
+def test_only_what_was_taught_is_bright(config: PretrainConfig) -> None:
+    """The panel of a real picture: sky over the street, above the LiDAR's view, is dim; the road is not."""
+    path = view(config, run_of(config), columns=16)[0]
+    with Image.open(path) as picture:
+        distance = np.asarray(picture.crop((656, 436, 1296, 796))).astype(int)
+    assert distance[:60].max() < 128 and distance[250:].max() > 200
 
 
 def test_from_above_forward_is_up_and_right_is_right(config: PretrainConfig) -> None:
