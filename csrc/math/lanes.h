@@ -59,6 +59,17 @@ inline __attribute__((always_inline)) void store(T* to, V v) {
   __builtin_memcpy(to, &v, sizeof v);
 }
 
+template <typename T, int N, int... I>
+inline __attribute__((always_inline)) Vec<T, N> lane_numbers(std::integer_sequence<int, I...>) {
+  return Vec<T, N>{I...};
+}
+
+// 0, 1, 2, ...
+template <typename T, int N>
+inline __attribute__((always_inline)) Vec<T, N> lane_numbers() {
+  return lane_numbers<T, N>(std::make_integer_sequence<int, N>());
+}
+
 template <int N, typename T>
 inline __attribute__((always_inline)) Vec<T, N> splat(T x) {
   return x - Vec<T, N>{};
@@ -115,6 +126,21 @@ template <int Lane, typename T, int N>
 inline __attribute__((always_inline)) Vec<T, N> broadcast(Vec<T, N> v) {
   return broadcast<Lane, T, N>(v, std::make_integer_sequence<int, N>());
 }
+
+// Lane i gets lane index[i] of v. Where this is one instruction; kPermute says so.
+#if defined(__AVX512F__)
+constexpr bool kPermute = true;
+inline __attribute__((always_inline)) Vec<float, 16> permute(Vec<float, 16> v, Vec<int32_t, 16> index) {
+  return _mm512_permutexvar_ps((__m512i)index, v);
+}
+#elif defined(__AVX2__)
+constexpr bool kPermute = true;
+inline __attribute__((always_inline)) Vec<float, 8> permute(Vec<float, 8> v, Vec<int32_t, 8> index) {
+  return _mm256_permutevar8x32_ps(v, (__m256i)index);
+}
+#else
+constexpr bool kPermute = false;
+#endif
 
 // Inclusive scans within a vector.
 template <typename T, int N, int K = 1>

@@ -25,7 +25,7 @@ struct ResampleRaysArgs {
 template <typename T>
 struct ResampleRaysKernels {
   int64_t (*scratch_size)(const ResampleRaysArgs<T>&);  // in elements, for one range
-  // merged [R, S + num_new]; int_scratch [S + 16]
+  // merged [R, S + num_new]; int_scratch [2 S + num_new + 48]
   void (*resample)(const ResampleRaysArgs<T>&, T* merged, T* scratch, int32_t* int_scratch, int64_t begin, int64_t end);
 };
 

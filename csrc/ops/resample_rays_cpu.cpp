@@ -3,9 +3,9 @@
 //
 // One iteration owns one ray and writes that ray's row only.
 //
-// A section's samples are written as whole vectors, of which the surplus lanes are overwritten by the sections that
-// follow; the row is assembled in scratch, so that no surplus leaves it. Rays whose t or u are out of order or not
-// finite take the slow path: search, then sort.
+// The row is assembled in scratch as whole vectors: section by section, each overwriting the surplus of the one before,
+// or vector by vector where lanes can be permuted. Rays whose t or u are out of order or not finite take the slow path:
+// search, then sort.
 #include "math/lanes.h"
 #include "ops/resample_rays.h"
 
@@ -36,7 +36,8 @@ template <typename T>
 struct Row {
   int64_t sections, size;  // size: padded
   T *t, *mass, *cdf, *slope, *u, *merged;
-  int32_t* end;  // [size] c_{i+1}
+  int32_t* end;     // [size] c_{i+1}
+  int32_t* starts;  // [S + num_new] 1 where a section starts in the merged row, else 0
 };
 
 template <typename T>
@@ -49,8 +50,17 @@ static Row<T> make_row(const ResampleRaysArgs<T>& a, T* scratch, int32_t* int_sc
   const int64_t sections = a.num_samples - 1, size = padded(sections), stride = size + 2 * kPad;
   T* first = scratch + kPad;
   T* u = first + 4 * stride;
-  return {sections,   size, first, first + stride, first + 2 * stride, first + 3 * stride, u, u + a.num_new + kPad,
-          int_scratch};
+  first[3 * stride + size] = T(0);  // the slope behind the last section
+  return {sections,
+          size,
+          first,
+          first + stride,
+          first + 2 * stride,
+          first + 3 * stride,
+          u,
+          u + a.num_new + kPad,
+          int_scratch,
+          int_scratch + size};
 }
 
 template <typename T>
@@ -76,7 +86,7 @@ static inline void accumulate(const T* mass, int64_t n, T* cumulative) {
 template <typename T>
 static inline void read_ranges(const T* __restrict t, const Row<T>& row) {
   for (int64_t i = 0; i <= row.sections; ++i) row.t[i] = t[i];
-  for (int64_t i = row.sections + 1; i <= row.size; ++i) row.t[i] = t[row.sections];
+  for (int64_t i = row.sections + 1; i <= row.size + 1; ++i) row.t[i] = t[row.sections];
 }
 
 // The cumulative distribution over sections, from 0 to exactly 1. False where there is none: a range is not finite.
@@ -106,73 +116,117 @@ static inline bool distribution(const T* __restrict weights, const Row<T>& row) 
 
 // How a row of u lies.
 enum class Spread {
-  kEven,  // u_k is in [k, k + 1] / n: midpoints, stratified
+  kRegular,  // u_k = (k + shift) / n: midpoints, jittered as a whole
+  kEven,     // u_k is in [k, k + 1] / n: stratified
   kAscending,
   kOther,
 };
 
+template <typename T>
+struct Positions {
+  Spread spread;
+  T shift;
+};
+
 // Clips u to [0, 1); keeps NaN.
 template <typename T>
-static inline Spread read_positions(const T* __restrict from, int64_t n, T* __restrict to) {
+static inline Positions<T> read_positions(const T* __restrict from, int64_t n, T* __restrict to) {
   for (int64_t i = 0; i < n; ++i) {
     const T low = from[i] < T(0) ? T(0) : from[i];
     to[i] = low > Limits<T>::below_one ? Limits<T>::below_one : low;
   }
   to[-1] = -__builtin_inf();  // ends every search
   to[n] = __builtin_inf();
-  if (!ascending(to, n + 1)) return Spread::kOther;  // with its end, so that a single NaN is noticed
-  const T slack = T(n) * (T(1) - Limits<T>::below_one) * T(8);
-  int32_t uneven = 0;
+  if (!ascending(to, n + 1)) return {Spread::kOther, T(0)};  // with its end, so that a single NaN is noticed
+  const T shift = to[0] * T(n), slack = T(n) * (T(1) - Limits<T>::below_one) * T(8);
+  int32_t uneven = 0, irregular = 0;
   for (int32_t k = 0; k < int32_t(n); ++k) {
     const T place = to[k] * T(n) - T(k);
     uneven |= place >= -slack && place <= T(1) + slack ? 0 : 1;
+    irregular |= place - shift >= -slack && place - shift <= slack ? 0 : 1;
   }
-  return uneven == 0 && slack < T(0.25) ? Spread::kEven : Spread::kAscending;
+  if (uneven != 0 || slack > T(0.25) || n == 0) return {Spread::kAscending, T(0)};
+  return {irregular == 0 ? Spread::kRegular : Spread::kEven, shift};
 }
 
-// row.end[i] = c_{i+1}, the number of samples with u < cdf_{i+1}. Never falls, and ends with num_new.
+// row.end[i] = c_{i+1}, the number of samples with u < cdf_{i+1}. Never falls, and ends with num_new. Up to rounding:
+// a sample that rounding puts into the neighbouring section is clipped to the end they share.
 template <typename T>
-static inline void section_ends(Spread spread, int64_t num_new, const Row<T>& row) {
+static inline void section_ends(const Positions<T>& positions, int64_t num_new, const Row<T>& row) {
   const T *u = row.u, *cdf = row.cdf;
-  if (spread == Spread::kEven) {
-    // All u before the place of cdf_{i+1} are below it and all after it are not, up to rounding; a sample that rounding
-    // puts into the neighbouring section is clipped to the end they share.
+  if (positions.spread == Spread::kRegular) {
+    for (int64_t i = 0; i < row.size; ++i) {
+      const T place = cdf[i + 1] * T(num_new) - positions.shift;
+      const int32_t below = int32_t(place);
+      row.end[i] = below + (T(below) < place ? 1 : 0);
+    }
+  } else if (positions.spread == Spread::kEven) {  // all u before the place of cdf_{i+1} are below it, none after it
     for (int64_t i = 0; i < row.size; ++i) {
       const int32_t place = int32_t(cdf[i + 1] * T(num_new));
       row.end[i] = place + (u[place] < cdf[i + 1] ? 1 : 0);
     }
-    return;
+  } else {
+    int32_t end = 0;
+    for (int64_t i = 0; i < row.sections; ++i) {
+      while (u[end] < cdf[i + 1]) ++end;
+      row.end[i] = end;
+    }
   }
-  int32_t end = 0;
-  for (int64_t i = 0; i < row.sections; ++i) {
-    while (u[end] < cdf[i + 1]) ++end;
-    row.end[i] = end;
-  }
+  row.end[row.sections - 1] = int32_t(num_new);
 }
 
 template <typename T>
-static inline void merge(int64_t num_new, const Row<T>& row) {
-  constexpr int W = kWidth<T>;
-  const T *t = row.t, *u = row.u, *cdf = row.cdf;
+static inline void section_slopes(const Row<T>& row) {
+  const T* __restrict t = row.t, * __restrict cdf = row.cdf;
   T* __restrict slope = row.slope;
   for (int64_t i = 0; i < row.size; ++i) {
     const T width = cdf[i + 1] - cdf[i];
     slope[i] = width >= Limits<T>::narrowest ? (t[i + 1] - t[i]) / width : T(0);
   }
+}
+
+// Where u lies in a section. u below it, which is that of the sample before, becomes the section's start.
+template <typename V>
+static inline __attribute__((always_inline)) V interpolate(V u, V cdf, V slope, V start, V end) {
+  const V offset = u - cdf;
+  const V x = start + (offset > V{} ? offset : V{}) * slope;
+  return x < end ? x : end;
+}
+
+template <typename T>
+static inline void merge(int64_t num_new, const Row<T>& row) {
+  constexpr int W = kWidth<T>;
   int64_t begin = 0;  // c_i
   for (int64_t i = 0; i < row.sections; ++i) {
     const int64_t end = row.end[i];
-    T* out = row.merged + i + 1;
-    // Lane 0 of the first vector is u[begin - 1] < cdf_i, which becomes t_i itself.
     for (int64_t k = begin - 1; k < end; k += W) {
-      Vec<T, W> offset = load<W>(u + k) - cdf[i];
-      offset = offset > T(0) ? offset : Vec<T, W>{};
-      const Vec<T, W> x = t[i] + offset * slope[i], last = splat<W>(t[i + 1]);
-      store(out + k, x < last ? x : last);
+      store(row.merged + i + 1 + k, interpolate(load<W>(row.u + k), splat<W>(row.cdf[i]), splat<W>(row.slope[i]),
+                                                splat<W>(row.t[i]), splat<W>(row.t[i + 1])));
     }
     begin = end;
   }
-  row.merged[row.sections + num_new] = t[row.sections];
+  row.merged[row.sections + num_new] = row.t[row.sections];
+}
+
+// The same, a vector of the merged row at a time: what its lanes need of sections and of u is in two windows.
+template <typename T>
+static inline void merge_permuted(int64_t num_new, const Row<T>& row) {
+  constexpr int W = kWidth<T>;
+  using Index = Vec<int32_t, W>;
+  const int64_t size = row.sections + 1 + num_new;
+  for (int64_t p = 0; p < size + W; ++p) row.starts[p] = 0;
+  row.starts[0] = 1;
+  for (int64_t i = 0; i < row.sections; ++i) row.starts[i + 1 + row.end[i]] = 1;
+  int64_t started = 0;  // sections that start before p
+  for (int64_t p = 0; p < size; p += W) {
+    const Index starts = load<W>(row.starts + p), count = prefix_sum<int32_t, W>(starts);
+    const Index section = count - broadcast<0, int32_t, W>(starts), sample = lane_numbers<int32_t, W>() - section;
+    const int64_t i = started - 1 + row.starts[p], k = p - i - 1;  // of lane 0
+    store(row.merged + p, interpolate(permute(load<W>(row.u + k), sample), permute(load<W>(row.cdf + i), section),
+                                      permute(load<W>(row.slope + i), section), permute(load<W>(row.t + i), section),
+                                      permute(load<W>(row.t + i + 1), section)));
+    started += count[W - 1];
+  }
 }
 
 template <typename T>
@@ -231,9 +285,9 @@ static void resample(const ResampleRaysArgs<T>& a, T* merged, T* scratch, int32_
                      int64_t end) {
   const Row<T> row = make_row(a, scratch, int_scratch);
   const int64_t out_size = a.num_samples + a.num_new;
-  Spread spread = Spread::kOther;
+  Positions<T> positions{};
   for (int64_t ray = begin; ray < end; ++ray) {
-    if (a.u_stride != 0 || ray == begin) spread = read_positions(a.u + ray * a.u_stride, a.num_new, row.u);
+    if (a.u_stride != 0 || ray == begin) positions = read_positions(a.u + ray * a.u_stride, a.num_new, row.u);
     if (ray + 1 < end) {
       prefetch(a.t + (ray + 1) * a.num_samples, a.num_samples);
       prefetch(a.weights + (ray + 1) * a.weight_stride, a.weight_stride);
@@ -242,10 +296,15 @@ static void resample(const ResampleRaysArgs<T>& a, T* merged, T* scratch, int32_
     read_ranges(a.t + ray * a.num_samples, row);
     const bool has_cdf = distribution(a.weights + ray * a.weight_stride, row);
     const bool in_order = ascending(row.t, row.size + 1) && row.t[0] >= -Limits<T>::largest &&
-                          row.t[row.size] <= Limits<T>::largest && spread != Spread::kOther;
+                          row.t[row.size] <= Limits<T>::largest && positions.spread != Spread::kOther;
     if (has_cdf && in_order) {
-      section_ends(spread, a.num_new, row);
-      merge(a.num_new, row);
+      section_ends(positions, a.num_new, row);
+      section_slopes(row);
+      if constexpr (kPermute && sizeof(T) == 4) {
+        merge_permuted(a.num_new, row);
+      } else {
+        merge(a.num_new, row);
+      }
     } else {
       merge_any(a.num_new, has_cdf, row);
     }

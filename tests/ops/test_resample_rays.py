@@ -40,6 +40,15 @@ def test_useless_weights_are_uniform(backend: str, bad: float) -> None:
     assert out[0].tolist() == pytest.approx([2.0, 3.0, 3.0, 5.0, 7.0, 9.0, 10.0])
 
 
+def test_empty_sections_hold_no_sample(backend: str) -> None:
+    # cdf 0, 0, 1/2, 1/2, 1: u = 0 starts the second section, u = 1/2 the last, and nothing lies in the others.
+    t = torch.tensor([[0.0, 1.0, 2.0, 5.0, 6.0]])
+    weights = torch.tensor([[0.0, 3.0, 0.0, 3.0]])
+    u = torch.tensor([0.0, 0.25, 0.5, 0.75])
+    assert resample_rays(t, weights, 4, u)[0].tolist() == [0.0, 1.0, 1.0, 1.5, 2.0, 5.0, 5.0, 5.5, 6.0]
+    assert resample_rays(t, weights, 1)[0].tolist() == [0.0, 1.0, 2.0, 5.0, 5.0, 6.0]  # u = 1/2
+
+
 def test_negative_weights_count_as_zero(backend: str) -> None:
     t = torch.tensor([[0.0, 1.0, 2.0, 3.0]])
     out = resample_rays(t, torch.tensor([[-5.0, 1.0, 0.0]]), 2)
@@ -79,9 +88,28 @@ def test_native_equals_reference(native: None, shape: tuple[int, int, int], dtyp
     assert_close(actual.double(), expected, 2e-5 if dtype == torch.float32 else 1e-11)
 
 
-def test_levels_agree(level: str) -> None:
-    t, weights = case(33, 96, torch.float64)
-    assert_close(resample_rays(t, weights, 128), reference.resample_rays(t, weights, 128), 1e-11)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("spread", ["midpoints", "shifted", "stratified", "random", "clustered", "same"])
+@pytest.mark.parametrize("shape", [(33, 96, 128), (9, 17, 200), (9, 130, 3), (5, 2, 40)])
+def test_levels_agree(level: str, shape: tuple[int, int, int], spread: str, dtype: torch.dtype) -> None:
+    """Every way in which u can lie, against the definition: the samples' places in the distribution are u."""
+    num_rays, samples, new = shape
+    t, weights = case(num_rays, samples)
+    weights = weights + 0.02  # so that float32 resolves every section
+    generator = torch.Generator().manual_seed(5)
+    noise = torch.rand(num_rays, new, generator=generator, dtype=torch.float64)
+    u = {
+        "midpoints": (torch.arange(new) + 0.5).expand(num_rays, -1) / new,
+        "shifted": (torch.arange(new) + noise[:, :1]) / new,
+        "stratified": (torch.arange(new) + noise) / new,
+        "random": noise.sort(dim=1).values,
+        "clustered": noise.sort(dim=1).values ** 8,
+        "same": noise[:, :1].expand(-1, new),
+    }[spread].double()
+    actual = resample_rays(t.to(dtype), weights.to(dtype), new, u.to(dtype))
+    expected = reference.resample_rays(t, weights, new, u)
+    assert (actual.diff(dim=1) >= 0).all()
+    assert_close(actual.double(), expected, 2e-5 if dtype == torch.float32 else 1e-12)
 
 
 def test_result_is_sorted_and_keeps_the_old_samples(backend: str) -> None:
@@ -101,6 +129,34 @@ def test_nan_stays_in_its_ray(backend: str, which: str) -> None:
     out = resample_rays(t, weights, 9, u)
     assert torch.equal(out[[0, 2, 3]], clean[[0, 2, 3]])
     assert out.shape == clean.shape
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_order_of_u_does_not_matter(backend: str, dtype: torch.dtype) -> None:
+    t, weights = case(5, 40, dtype)
+    u = torch.rand(5, 30, generator=torch.Generator().manual_seed(1), dtype=dtype)
+    assert_close(resample_rays(t, weights, 30, u), resample_rays(t, weights, 30, u.sort(dim=1).values), 1e-6)
+
+
+@pytest.mark.parametrize("kind", ["t descends", "t is infinite", "t is NaN", "u is NaN", "all are NaN"])
+def test_any_input_gives_a_sorted_row(backend: str, kind: str) -> None:
+    t, weights = case(3, 24, torch.float32)
+    u = torch.rand(3, 50, generator=torch.Generator().manual_seed(0)).sort(dim=1).values
+    if kind == "t descends":
+        t = t.flip(1)
+    elif kind == "t is infinite":
+        t[:, -1] = torch.inf
+    if kind in ("t is NaN", "all are NaN"):
+        t[:, 3] = torch.nan
+    if kind in ("u is NaN", "all are NaN"):
+        u[:, 7] = torch.nan
+    if kind == "all are NaN":
+        weights[:] = torch.nan
+    out, expected = resample_rays(t, weights, 50, u), reference.resample_rays(t, weights, 50, u)
+    assert torch.equal(out.isnan(), expected.isnan())
+    assert (out.diff(dim=1) >= 0).logical_or(out[:, 1:].isnan()).logical_or(out[:, 1:] == torch.inf).all()
+    finite = expected.isfinite()
+    assert_close(out[finite], expected[finite], 1e-4)
 
 
 def test_unsorted_and_outlying_u_touch_no_foreign_memory(backend: str) -> None:
