@@ -94,13 +94,20 @@ def test_opaque_sample_has_the_right_gradient(backend: str) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("sharp", [500.0, -500.0])
 def test_sharp_surfaces_stay_finite(backend: str, sharp: float, dtype: torch.dtype) -> None:
-    """s d = +-500, rising, falling, crossing: finite values and gradients."""
+    """s d = +-500, rising, falling, crossing: finite values and gradients, those of the definition."""
     rows = [[1.0, 0.5, 0.2, 0.1], [-1.0, -0.5, 0.5, 1.0], [1.0, -1.0, 1.0, -1.0], [-0.2, -0.5, -0.7, -1.0]]
     sdf = torch.tensor(rows, dtype=dtype) * (1 if sharp > 0 else -1)
     inputs = (sdf, torch.tensor(abs(sharp), dtype=dtype), torch.arange(1.0, 5.0, dtype=dtype).expand(4, -1))
     found = results(composite_rays, (*inputs, torch.ones(4, 4, 2, dtype=dtype)))
     assert all(value.isfinite().all() for value in found.values())
     assert (found["weights"] >= 0).all() and (found["opacity"] <= 1 + 1e-6).all()
+    # A rising ray meets nothing, the others the section that crosses, or the first one inside.
+    sections = [None, None, 0, 0] if sharp > 0 else [None, 1, 1, None]
+    for weights, section in zip(found["weights"], sections, strict=True):
+        expected = torch.zeros(4, dtype=dtype)
+        if section is not None:
+            expected[section] = 1.0
+        assert (weights - expected).abs().max() <= 1e-6
 
 
 def test_free_space_is_empty(backend: str) -> None:
@@ -158,6 +165,37 @@ def test_without_values(native: None) -> None:
     assert out.values is None and expected.values is None
     for actual, wanted in zip(out[:3], expected[:3], strict=True):
         assert_close(actual, wanted, FORWARD[torch.float64])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 7, 8, 9, 15, 16, 17, 31, 40, 64, 65, 130])
+def test_any_number_of_channels(level: str, channels: int, dtype: torch.dtype) -> None:
+    """Channels go through vectors of every width, several at a time, with a remainder; also without any distance."""
+    inputs = case(2, 83, channels, dtype)
+    for options in ({}, {"detach_sdf": True}):
+        actual = results(composite_rays, inputs, ("values",), **options)
+        expected = results(
+            reference.composite_rays, tuple(tensor.double() for tensor in inputs), ("values",), **options
+        )
+        for name, value in actual.items():
+            tolerance = 3 * (GRADIENT if name.startswith("grad") else FORWARD)[dtype]
+            assert_close(value.double(), expected[name], tolerance, name)
+
+
+def test_large_gradient_equals_that_of_its_parts(native: None) -> None:
+    """A gradient of 16 MiB and more is stored past the caches."""
+    inputs = case(301, 225, 64, torch.float32)
+    whole = results(composite_rays, inputs, ("values",))
+    assert whole["grad_values"].nbytes > 16 << 20
+    generator = torch.Generator().manual_seed(7)
+    cotangent = torch.randn(301, 64, generator=generator, dtype=torch.float64).float()
+    for rays in (slice(0, 150), slice(150, 301)):
+        sdf, inv_s, t, values = inputs
+        part = values[rays].clone().requires_grad_()
+        out = composite_rays(sdf[rays], inv_s, t[rays], part)
+        assert out.values is not None
+        (grad,) = torch.autograd.grad((out.values * cotangent[rays]).sum(), part)
+        assert torch.equal(grad, whole["grad_values"][rays])
 
 
 def test_levels_agree(level: str) -> None:
@@ -255,6 +293,37 @@ def test_nan_stays_in_its_ray(backend: str, which: str) -> None:
         if name != "grad_inv_s":  # shared by all rays
             assert torch.equal(value[others], clean[name][others]), name
     assert any(value[1].isnan().any() for name, value in found.items() if name != "grad_inv_s")
+
+
+@pytest.mark.parametrize("samples", [16, 21])
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_nan_gradient_stays_in_its_ray(backend: str, output: str, samples: int) -> None:
+    sdf, inv_s, t, values = case(4, samples, 3, torch.float32)
+    leaves = [tensor.clone().requires_grad_() for tensor in (sdf, t, values)]
+    out = composite_rays(leaves[0], inv_s, leaves[1], leaves[2])
+    cotangents = {name: torch.ones_like(getattr(out, name)) for name in OUTPUTS}
+    clean = torch.autograd.grad([getattr(out, name) for name in OUTPUTS], leaves, list(cotangents.values()), True)
+    cotangents[output][1] = torch.nan
+    found = torch.autograd.grad([getattr(out, name) for name in OUTPUTS], leaves, list(cotangents.values()))
+    for name, actual, expected in zip(("sdf", "t", "values"), found, clean, strict=True):
+        assert torch.equal(actual[[0, 2, 3]], expected[[0, 2, 3]]), name
+
+
+@pytest.mark.parametrize("shape", [(0, 5), (3, 0), (0, 0)])
+@pytest.mark.parametrize("channels", [0, 2])
+def test_empty(backend: str, shape: tuple[int, int], channels: int) -> None:
+    inputs = (torch.randn(shape), torch.tensor(2.7), torch.randn(shape), torch.randn(*shape, channels))
+    found = results(composite_rays, inputs)
+    for name, tensor in zip(INPUTS, inputs, strict=True):
+        assert found[f"grad_{name}"].shape == tensor.shape and not found[f"grad_{name}"].any()
+    assert found["depth"].shape == (shape[0],) and found["values"].shape == (shape[0], channels)
+    assert not found["depth"].any() and not found["opacity"].any() and not found["values"].any()
+
+
+def test_negative_sharpness_is_nan(backend: str) -> None:
+    sdf, _, t, values = case()
+    out = composite_rays(sdf, torch.tensor(-1.0, dtype=torch.float64), t, values)
+    assert out.depth.isnan().all() and out.values is not None and out.values.isnan().all()
 
 
 def test_layouts_agree(backend: str) -> None:
