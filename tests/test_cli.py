@@ -55,6 +55,15 @@ def test_help_imports_nothing_heavy() -> None:
     assert output.splitlines()[-1] == "set()"
 
 
+def test_threads_do_not_spin_for_long_unless_asked_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
+    cli.main(["--version"])
+    assert os.environ["GOMP_SPINCOUNT"] == "10000"
+    monkeypatch.setenv("GOMP_SPINCOUNT", "7")
+    cli.main(["--version"])
+    assert os.environ["GOMP_SPINCOUNT"] == "7"
+
+
 @pytest.mark.parametrize("name", ["pretrain", "evaluate", "view", "doctor"])
 def test_each_command_has_help(name: str, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
