@@ -8,6 +8,7 @@
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
 
+#include <limits>
 #include <sstream>
 #include <stdexcept>
 #include <string>
@@ -49,6 +50,16 @@ inline void check_sizes(const char* op, const char* name, const Tensor& tensor, 
     PRED_CHECK(tensor.size(int64_t(dim)) == sizes[dim], op, ": size ", dim, " of ", name, " must be ", sizes[dim],
                ", got shape ", shape_text(tensor));
   }
+}
+
+// The sharpness of a sigmoid.
+template <typename T>
+T read_sharpness(const char* op, const Tensor& inv_s, ScalarType dtype) {
+  check_cpu_tensor(op, "inv_s", inv_s, 0, dtype);
+  const T value = *inv_s.const_data_ptr<T>();
+  PRED_CHECK(value >= 0 && value <= std::numeric_limits<T>::max(), op, ": inv_s must be finite and not negative, got ",
+             value);
+  return value;
 }
 
 // Calls `body` with T = float or double.

@@ -7,6 +7,8 @@
 // defines a table of function pointers there; the binding picks a table with PRED_KERNELS(name).
 #pragma once
 
+#include <type_traits>
+
 namespace pred {
 
 enum class Isa { kDefault, kAvx2, kAvx512, kAvx512Bf16 };
@@ -16,6 +18,20 @@ enum class Isa { kDefault, kAvx2, kAvx512, kAvx512Bf16 };
 Isa active_isa();
 
 const char* isa_name(Isa isa);
+
+template <class Table>
+const Table& pick(Isa isa, const Table& baseline, const Table& avx2, const Table& avx512, const Table& avx512_bf16) {
+  switch (isa) {
+    case Isa::kAvx512Bf16:
+      return avx512_bf16;
+    case Isa::kAvx512:
+      return avx512;
+    case Isa::kAvx2:
+      return avx2;
+    default:
+      return baseline;
+  }
+}
 
 }  // namespace pred
 
@@ -33,11 +49,9 @@ const char* isa_name(Isa isa);
   namespace pred::isa_avx512_bf16 {       \
   extern const Table name;                \
   }
-#define PRED_KERNELS(name)                                                          \
-  (::pred::active_isa() == ::pred::Isa::kAvx512Bf16 ? ::pred::isa_avx512_bf16::name \
-   : ::pred::active_isa() == ::pred::Isa::kAvx512   ? ::pred::isa_avx512::name      \
-   : ::pred::active_isa() == ::pred::Isa::kAvx2     ? ::pred::isa_avx2::name        \
-                                                    : ::pred::isa_default::name)
+#define PRED_KERNELS(name)                                                                                         \
+  (::pred::pick(::pred::active_isa(), ::pred::isa_default::name, ::pred::isa_avx2::name, ::pred::isa_avx512::name, \
+                ::pred::isa_avx512_bf16::name))
 #else
 #define PRED_DECLARE_KERNELS(Table, name) \
   namespace pred::isa_default {           \
@@ -45,3 +59,13 @@ const char* isa_name(Isa isa);
   }
 #define PRED_KERNELS(name) (::pred::active_isa(), ::pred::isa_default::name)
 #endif
+
+// Defines kernels<T>(): the table name_f32 or name_f64 of the level in force.
+#define PRED_KERNELS_BY_TYPE(Table, name)   \
+  template <typename T>                     \
+  const Table<T>& kernels() {               \
+    if constexpr (std::is_same_v<T, float>) \
+      return PRED_KERNELS(name##_f32);      \
+    else                                    \
+      return PRED_KERNELS(name##_f64);      \
+  }

@@ -9,6 +9,7 @@
 
 #include <atomic>
 #include <exception>
+#include <vector>
 
 namespace pred {
 
@@ -27,6 +28,13 @@ void parallel(int64_t count, int64_t grain, const Body& body) {
     }
   });
   if (error) std::rethrow_exception(error);
+}
+
+// One thread, in order: the same bits for any number of threads.
+inline double ordered_sum(const std::vector<double>& parts) {
+  double sum = 0;
+  for (const double part : parts) sum += part;
+  return sum;
 }
 
 }  // namespace pred

@@ -1,7 +1,7 @@
 // Copyright 2026 The PRED authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Opacity of the section between two neighbouring samples of a ray (PRED, Eq. 5), with Phi = sigmoid and s >= 0:
+// Opacity of the section between two neighbouring samples of a ray (PRED, Eq. 4), with Phi = sigmoid and s >= 0:
 //   alpha = max(1 - Phi(s d_next) / Phi(s d), 0) = Phi(-s d_next) (1 - decay),  decay = exp(-s max(d - d_next, 0))
 //   1 - alpha                                    = Phi(s d_next) + Phi(-s d_next) decay
 // No subtraction of near-equal numbers, no division: exact towards both ends, 0 and 1.
@@ -39,12 +39,6 @@ PRED_HOST_DEVICE PairAlpha<V> pair_alpha(const ExpScale<T>& s, V sdf, V next_sdf
   const V rise = next_sdf - sdf;
   const Exp<V> e = exp_nonpositive(s, rise >= V{} ? V{} : rise);  // NaN stays NaN
   return {next.occupied * -e.expm1, next.free + next.occupied * e.exp, e.exp, -e.expm1};
-}
-
-// The sharpness as the formulas take it: below 0, where they mean nothing, everything becomes NaN.
-template <typename T>
-PRED_HOST_DEVICE T valid_sharpness(T inv_s) {
-  return inv_s >= T(0) ? inv_s : T(__builtin_nan(""));
 }
 
 }  // namespace pred

@@ -15,13 +15,7 @@
 namespace pred {
 namespace {
 
-template <typename T>
-const CompositeRaysKernels<T>& kernels() {
-  if constexpr (std::is_same_v<T, float>)
-    return PRED_KERNELS(composite_rays_f32);
-  else
-    return PRED_KERNELS(composite_rays_f64);
-}
+PRED_KERNELS_BY_TYPE(CompositeRaysKernels, composite_rays)
 
 // From this size on, a gradient would push everything else out of the caches.
 constexpr int64_t kStreamBytes = int64_t(16) << 20;
@@ -41,11 +35,10 @@ struct Inputs {
   int64_t num_rays;
 
   Inputs(const char* op, const Tensor& sdf_in, const Tensor& inv_s, const Tensor& t_in,
-         const std::optional<Tensor>& values_in, bool depth_mid, bool last_opaque)
-      : num_rays(sdf_in.size(0)) {
+         const std::optional<Tensor>& values_in, bool depth_mid, bool last_opaque) {
     const ScalarType dtype = sdf_in.scalar_type();
     check_cpu_tensor(op, "sdf", sdf_in, 2, dtype);
-    check_cpu_tensor(op, "inv_s", inv_s, 0, dtype);
+    num_rays = sdf_in.size(0);
     check_cpu_tensor(op, "t", t_in, 2, dtype);
     check_sizes(op, "t", t_in, {num_rays, sdf_in.size(1)});
     sdf = torch::stable::contiguous(sdf_in);
@@ -53,7 +46,7 @@ struct Inputs {
     args = {sdf.const_data_ptr<T>(),
             t.const_data_ptr<T>(),
             nullptr,
-            valid_sharpness(*inv_s.const_data_ptr<T>()),
+            read_sharpness<T>(op, inv_s, dtype),
             sdf.size(1),
             0,
             depth_mid,
@@ -151,11 +144,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_rays_backward(
         k.backward(a, saved, grad, out, scratch, begin, end);
       });
     }
-    if (need_inv_s) {  // one thread, in order: the same bits for any number of threads
-      double sum = 0;
-      for (const double part : per_ray) sum += part;
-      *data<T>(out_inv_s) = T(sum);
-    }
+    if (need_inv_s) *data<T>(out_inv_s) = T(ordered_sum(per_ray));
     return std::make_tuple(out_sdf, out_inv_s, out_t, out_values);
   });
 }

@@ -13,13 +13,7 @@
 namespace pred {
 namespace {
 
-template <typename T>
-const ResampleRaysKernels<T>& kernels() {
-  if constexpr (std::is_same_v<T, float>)
-    return PRED_KERNELS(resample_rays_f32);
-  else
-    return PRED_KERNELS(resample_rays_f64);
-}
+PRED_KERNELS_BY_TYPE(ResampleRaysKernels, resample_rays)
 
 Tensor resample_rays(const Tensor& t_in, const Tensor& weights_in, const Tensor& u_in) {
   return PRED_DISPATCH_FLOAT("resample_rays", t_in.scalar_type(), [&] {

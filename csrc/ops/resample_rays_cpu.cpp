@@ -149,16 +149,17 @@ static inline Positions<T> read_positions(const T* __restrict from, int64_t n, T
   return {irregular == 0 ? Spread::kRegular : Spread::kEven, shift};
 }
 
-// row.end[i] = c_{i+1}, the number of samples with u < cdf_{i+1}. Never falls, and ends with num_new. Up to rounding:
-// a sample that rounding puts into the neighbouring section is clipped to the end they share.
+// row.end[i] = c_{i+1}, the number of samples with u < cdf_{i+1}; the last is num_new. Up to rounding: a sample that
+// rounding puts into the neighbouring section is clipped to the end they share, and where rounding makes the sums fall
+// so may these; whoever walks along them keeps the largest so far.
 template <typename T>
 static inline void section_ends(const Positions<T>& positions, int64_t num_new, const Row<T>& row) {
   const T *u = row.u, *cdf = row.cdf;
   if (positions.spread == Spread::kRegular) {
     for (int64_t i = 0; i < row.size; ++i) {
       const T place = cdf[i + 1] * T(num_new) - positions.shift;
-      const int32_t below = int32_t(place);
-      row.end[i] = below + (T(below) < place ? 1 : 0);
+      const int32_t below = int32_t(place), end = below + (T(below) < place ? 1 : 0);
+      row.end[i] = cdf[i + 1] >= T(1) ? int32_t(num_new) : end;  // u that was clipped lies below 1 too
     }
   } else if (positions.spread == Spread::kEven) {  // all u before the place of cdf_{i+1} are below it, none after it
     for (int64_t i = 0; i < row.size; ++i) {
@@ -198,7 +199,7 @@ static inline void merge(int64_t num_new, const Row<T>& row) {
   constexpr int W = kWidth<T>;
   int64_t begin = 0;  // c_i
   for (int64_t i = 0; i < row.sections; ++i) {
-    const int64_t end = row.end[i];
+    const int64_t end = row.end[i] > begin ? row.end[i] : begin;
     for (int64_t k = begin - 1; k < end; k += W) {
       store(row.merged + i + 1 + k, interpolate(load<W>(row.u + k), splat<W>(row.cdf[i]), splat<W>(row.slope[i]),
                                                 splat<W>(row.t[i]), splat<W>(row.t[i + 1])));
@@ -216,7 +217,11 @@ static inline void merge_permuted(int64_t num_new, const Row<T>& row) {
   const int64_t size = row.sections + 1 + num_new;
   for (int64_t p = 0; p < size + W; ++p) row.starts[p] = 0;
   row.starts[0] = 1;
-  for (int64_t i = 0; i < row.sections; ++i) row.starts[i + 1 + row.end[i]] = 1;
+  int32_t end = 0;
+  for (int64_t i = 0; i < row.sections; ++i) {
+    end = row.end[i] > end ? row.end[i] : end;
+    row.starts[i + 1 + end] = 1;
+  }
   int64_t started = 0;  // sections that start before p
   for (int64_t p = 0; p < size; p += W) {
     const Index starts = load<W>(row.starts + p), count = prefix_sum<int32_t, W>(starts);

@@ -19,13 +19,7 @@ namespace {
 
 using torch::headeronly::MemoryFormat;
 
-template <typename T>
-const SampleBevKernels<T>& kernels() {
-  if constexpr (std::is_same_v<T, float>)
-    return PRED_KERNELS(sample_bev_f32);
-  else
-    return PRED_KERNELS(sample_bev_f64);
-}
+PRED_KERNELS_BY_TYPE(SampleBevKernels, sample_bev)
 
 // Samples per task, such that a task moves some 64 kB.
 int64_t sample_grain(int64_t channels) { return 1 + 16384 / (channels + 16); }
@@ -37,9 +31,9 @@ struct Inputs {
   SampleBevArgs<T> args;
   int64_t batch;
 
-  Inputs(const char* op, const Tensor& bev_in, const Tensor& grid_in, bool border, bool align_corners)
-      : batch(bev_in.size(0)) {
+  Inputs(const char* op, const Tensor& bev_in, const Tensor& grid_in, bool border, bool align_corners) {
     check_cpu_tensor(op, "bev", bev_in, 4, bev_in.scalar_type());
+    batch = bev_in.size(0);
     check_cpu_tensor(op, "grid", grid_in, 3, bev_in.scalar_type());
     PRED_CHECK(grid_in.size(0) == batch && grid_in.size(2) == 2, op, ": grid must have shape [", batch, ", N, 2], got ",
                shape_text(grid_in));
@@ -174,8 +168,9 @@ std::tuple<Tensor, Tensor> sample_bev_backward(const Tensor& grad, const Tensor&
       if (need_grid) torch::stable::zero_(grad_grid);  // samples that touch nothing are not visited
       grad_bev = scatter(in, false, data);
     } else if (need_grid) {
+      const auto& k = kernels<T>();
       parallel(in.num_samples(), sample_grain(a.channels),
-               [&](int64_t begin, int64_t end) { kernels<T>().backward_grid(a, data, begin, end); });
+               [&](int64_t begin, int64_t end) { k.backward_grid(a, data, begin, end); });
     }
     return std::make_tuple(grad_bev, grad_grid);
   });
@@ -198,8 +193,9 @@ std::tuple<Tensor, Tensor, Tensor> sample_bev_double_backward(std::optional<Tens
     T* grad_data = need_grad ? out_grad.mutable_data_ptr<T>() : nullptr;
     T* grid_data = need_grid ? out_grid.mutable_data_ptr<T>() : nullptr;
     if (need_grad || need_grid) {
+      const auto& k = kernels<T>();
       parallel(in.num_samples(), sample_grain(a.channels),
-               [&](int64_t begin, int64_t end) { kernels<T>().double_backward(a, grad_data, grid_data, begin, end); });
+               [&](int64_t begin, int64_t end) { k.double_backward(a, grad_data, grid_data, begin, end); });
     }
     if (need_bev && a.grad_grad_grid) {
       out_bev = scatter<T>(in, true, nullptr);

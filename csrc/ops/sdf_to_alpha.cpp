@@ -14,21 +14,14 @@
 namespace pred {
 namespace {
 
-template <typename T>
-const SdfToAlphaKernels<T>& kernels() {
-  if constexpr (std::is_same_v<T, float>)
-    return PRED_KERNELS(sdf_to_alpha_f32);
-  else
-    return PRED_KERNELS(sdf_to_alpha_f64);
-}
+PRED_KERNELS_BY_TYPE(SdfToAlphaKernels, sdf_to_alpha)
 
 // Rays per task, such that a task takes some 50 microseconds.
 int64_t ray_grain(int64_t num_samples) { return 1 + 16384 / (num_samples + 1); }
 
 template <typename T>
 SdfToAlphaArgs<T> arguments(const char* op, const Tensor& sdf, const Tensor& inv_s, bool last_opaque) {
-  check_cpu_tensor(op, "inv_s", inv_s, 0, sdf.scalar_type());
-  return {sdf.const_data_ptr<T>(), valid_sharpness(*inv_s.const_data_ptr<T>()), sdf.size(1), last_opaque};
+  return {sdf.const_data_ptr<T>(), read_sharpness<T>(op, inv_s, sdf.scalar_type()), sdf.size(1), last_opaque};
 }
 
 Tensor sdf_to_alpha(const Tensor& sdf_in, const Tensor& inv_s, bool last_opaque) {
@@ -66,11 +59,7 @@ std::tuple<Tensor, Tensor> sdf_to_alpha_backward(const Tensor& grad_in, const Te
         k.backward(a, grad.const_data_ptr<T>(), out, need_inv_s ? per_ray.data() : nullptr, scratch.data(), begin, end);
       });
     }
-    if (need_inv_s) {  // one thread, in order: the same bits for any number of threads
-      double sum = 0;
-      for (const double part : per_ray) sum += part;
-      *grad_inv_s.mutable_data_ptr<T>() = T(sum);
-    }
+    if (need_inv_s) *grad_inv_s.mutable_data_ptr<T>() = T(ordered_sum(per_ray));
     return std::make_tuple(grad_sdf, grad_inv_s);
   });
 }

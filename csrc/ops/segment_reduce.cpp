@@ -15,13 +15,7 @@
 namespace pred {
 namespace {
 
-template <typename T>
-const SegmentReduceKernels<T>& kernels() {
-  if constexpr (std::is_same_v<T, float>)
-    return PRED_KERNELS(segment_reduce_f32);
-  else
-    return PRED_KERNELS(segment_reduce_f64);
-}
+PRED_KERNELS_BY_TYPE(SegmentReduceKernels, segment_reduce)
 
 SegmentReduction reduction(const char* op, const std::string& name) {
   if (name == "sum") return SegmentReduction::kSum;
@@ -37,9 +31,10 @@ int64_t row_grain(int64_t channels) { return 1 + 16384 / (channels + 4); }
 template <typename T>
 void check_index(const Tensor& index, int64_t num_segments) {
   const int64_t* data = index.const_data_ptr<int64_t>();
+  const auto& k = kernels<T>();
   std::atomic<bool> valid{true};
   parallel(index.size(0), 32768, [&](int64_t begin, int64_t end) {
-    if (!kernels<T>().is_valid(data, num_segments, begin, end)) valid = false;
+    if (!k.is_valid(data, num_segments, begin, end)) valid = false;
   });
   for (int64_t row = 0; !valid; ++row) {
     PRED_CHECK(data[row] >= -1 && data[row] < num_segments,
@@ -106,8 +101,9 @@ Tensor segment_reduce_backward(const Tensor& grad_in, const Tensor& index_in, co
     const int64_t* index_data = index.const_data_ptr<int64_t>();
     const int32_t* saved_data = saved.const_data_ptr<int32_t>();
     T* out_data = out.mutable_data_ptr<T>();
+    const auto& k = kernels<T>();
     parallel(num_rows, row_grain(channels), [&](int64_t begin, int64_t end) {
-      kernels<T>().backward[int(how)](grad_data, channels, index_data, saved_data, out_data, begin, end);
+      k.backward[int(how)](grad_data, channels, index_data, saved_data, out_data, begin, end);
     });
     return out;
   });

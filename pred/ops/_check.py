@@ -32,10 +32,16 @@ def check_dtype(op: str, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype
 
 def check_like(op: str, name: str, tensor: Tensor, other_name: str, other: Tensor) -> None:
     """``tensor`` must have the dtype and device of ``other``."""
-    if tensor.dtype != other.dtype and not torch.is_autocast_enabled(tensor.device.type):
+    if tensor.dtype != other.dtype:
         raise TypeError(f"{op}: {name} must have the dtype of {other_name} ({other.dtype}), got {tensor.dtype}")
     if tensor.device != other.device:
         raise ValueError(f"{op}: {name} must be on the device of {other_name} ({other.device}), got {tensor.device}")
+
+
+def widen(tensor: Tensor) -> Tensor:
+    """In a half-precision (autocast) region: the tensor in float32 if it is narrower."""
+    half = tensor.dtype in (torch.bfloat16, torch.float16)
+    return tensor.float() if half and torch.is_autocast_enabled(tensor.device.type) else tensor
 
 
 def check_choice(op: str, name: str, value: str, choices: Sequence[str]) -> None:

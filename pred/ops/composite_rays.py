@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import check_choice, check_like, check_shape
-from pred.ops.sdf_to_alpha import sdf_arguments, sdf_to_alpha_reference, valid_sharpness, widen
+from pred.ops._check import check_choice, check_like, check_shape, widen
+from pred.ops.sdf_to_alpha import sdf_arguments, sdf_to_alpha_reference, valid_sharpness
 
 
 class Composite(NamedTuple):
@@ -36,7 +36,7 @@ def composite_rays(
     detach_inv_s: bool = True,
     normalize_eps: float = 1e-10,
 ) -> Composite:
-    """Renders depth and channels from signed distances along rays (PRED, Eq. 5).
+    """Renders depth and channels from signed distances along rays (PRED, Eq. 4).
 
     ``w_i = alpha_i prod_{j<i} (1 - alpha_j)`` with the opacities of :func:`pred.ops.sdf_to_alpha`;
     ``depth = sum_i w_i t_i``, ``opacity = sum_i w_i``, ``values = sum_i w_i values_i``. Weight i belongs to the section
@@ -44,8 +44,7 @@ def composite_rays(
 
     Args:
         sdf: ``[R, S]`` or ``[R, S, 1]`` signed distances in metres, float32 or float64.
-        inv_s: sharpness per metre, above 0: a number, which is checked, or a tensor of one element, which gives NaN
-            where it is negative.
+        inv_s: sharpness per metre, finite and not negative: a number, or a tensor of one element.
         t: ``[R, S]`` or ``[R, S, 1]`` range of each sample in metres, same dtype.
         values: ``[R, S, C]`` anything to be rendered, such as class probabilities, same dtype.
         depth_at: where a section's depth is read: its ``"start"`` ``t_i``, or its middle (``"mid"``); the last sample,
@@ -62,26 +61,32 @@ def composite_rays(
         A NaN stays in its ray (and in the gradient of ``inv_s``, which all rays share).
 
     Raises:
-        ValueError: shape, device or an unknown choice. TypeError: dtype.
+        ValueError: shape, device, an unknown choice, or the value of ``inv_s`` (see :func:`pred.ops.sdf_to_alpha`).
+        TypeError: dtype.
 
     Differentiable once in ``sdf``, ``inv_s``, ``t`` and ``values``, through all outputs; exact for opacities 0 and 1.
     Deterministic for any thread count.
     """
-    op = "composite_rays"
-    check_choice(op, "depth_at", depth_at, ("start", "mid"))
-    check_choice(op, "last", last, ("zero", "opaque"))
-    sdf, inv_s, t, values = _arguments(sdf, inv_s, t, values)
-    if detach_sdf:
-        sdf = sdf.detach()
-        inv_s = inv_s.detach() if detach_inv_s else inv_s
-    if _native.use_native(op, sdf):
-        weights, depth, opacity, rendered, _ = torch.ops.pred.composite_rays(
-            sdf, inv_s, t, values, depth_at == "mid", last == "opaque"
+    if not _native.use_native("composite_rays", sdf):
+        return composite_rays_reference(
+            sdf,
+            inv_s,
+            t,
+            values,
+            depth_at=depth_at,
+            normalize_depth=normalize_depth,
+            last=last,
+            detach_sdf=detach_sdf,
+            detach_inv_s=detach_inv_s,
+            normalize_eps=normalize_eps,
         )
-        out = Composite(weights, depth, opacity, None if values is None else rendered)
-    else:
-        out = composite_rays_reference(sdf, inv_s, t, values, depth_at=depth_at, last=last)
-    return out._replace(depth=out.depth / (out.opacity + normalize_eps)) if normalize_depth else out
+    sdf, inv_s, t, values = _arguments(sdf, inv_s, t, values, depth_at, last, detach_sdf, detach_inv_s)
+    weights, depth, opacity, rendered, _ = torch.ops.pred.composite_rays(
+        sdf, inv_s, t, values, depth_at == "mid", last == "opaque"
+    )
+    if normalize_depth:
+        depth = depth / (opacity + normalize_eps)
+    return Composite(weights, depth, opacity, None if values is None else rendered)
 
 
 def composite_rays_reference(
@@ -98,11 +103,8 @@ def composite_rays_reference(
     normalize_eps: float = 1e-10,
 ) -> Composite:
     """Plain PyTorch form of :func:`composite_rays`, with optical depths ``tau = -log(1 - alpha)``."""
-    sdf, inv_s, t, values = _arguments(sdf, inv_s, t, values)
-    if detach_sdf:
-        sdf = sdf.detach()
-        inv_s = inv_s.detach() if detach_inv_s else inv_s
-    inv_s = valid_sharpness(inv_s)
+    sdf, inv_s, t, values = _arguments(sdf, inv_s, t, values, depth_at, last, detach_sdf, detach_inv_s)
+    inv_s = valid_sharpness("composite_rays", inv_s)
     alpha = sdf_to_alpha_reference(sdf, inv_s, last=last)
     # 1 - alpha_i = Phi(d_{i+1}) / Phi(d_i). The difference of logarithms is inexact for small alpha, log1p for large;
     # where() twice keeps the other branch's derivative finite.
@@ -126,10 +128,18 @@ def composite_rays_reference(
 
 
 def _arguments(
-    sdf: Tensor, inv_s: Tensor | float, t: Tensor, values: Tensor | None
+    sdf: Tensor,
+    inv_s: Tensor | float,
+    t: Tensor,
+    values: Tensor | None,
+    depth_at: str,
+    last: str,
+    detach_sdf: bool,
+    detach_inv_s: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     op = "composite_rays"
-    sdf, inv_s = sdf_arguments(op, sdf, inv_s)
+    check_choice(op, "depth_at", depth_at, ("start", "mid"))
+    sdf, inv_s = sdf_arguments(op, sdf, inv_s, "pair", last)
     t = widen(t[..., 0] if t.dim() == 3 and t.shape[2] == 1 else t)
     where = f" as sdf, with R={sdf.shape[0]} and S={sdf.shape[1]}"
     check_shape(op, "t", t, sdf.shape, where)
@@ -138,6 +148,9 @@ def _arguments(
         values = widen(values)
         check_shape(op, "values", values, (*sdf.shape, "C"))
         check_like(op, "values", values, "sdf", sdf)
+    if detach_sdf:
+        sdf = sdf.detach()
+        inv_s = inv_s.detach() if detach_inv_s else inv_s
     return sdf, inv_s, t, values
 
 

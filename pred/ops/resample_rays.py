@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, check_dtype, check_like, check_shape
-from pred.ops.sdf_to_alpha import widen
+from pred.ops._check import FLOATING, check_dtype, check_like, check_shape, widen
 
 
 def resample_rays(
@@ -44,11 +43,10 @@ def resample_rays(
 
     Deterministic for any thread count.
     """
-    t, weights, u = _arguments(t, weights, num_samples, u)
-    if _native.use_native("resample_rays", t):
-        out: Tensor = torch.ops.pred.resample_rays(t, weights, u)
-        return out
-    return resample_rays_reference(t, weights, num_samples, u)
+    if not _native.use_native("resample_rays", t):
+        return resample_rays_reference(t, weights, num_samples, u)
+    out: Tensor = torch.ops.pred.resample_rays(*_arguments(t, weights, num_samples, u))
+    return out
 
 
 @torch.no_grad()
@@ -115,5 +113,4 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[None, None, None]:
     return None, None, None
 
 
-if _native.available():
-    _native.register("resample_rays", fake=_fake, setup_context=_save, backward=_backward)
+_native.register("resample_rays", fake=_fake, setup_context=_save, backward=_backward)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, check_choice, check_dtype, check_like, check_shape
+from pred.ops._check import FLOATING, check_choice, check_dtype, check_like, check_shape, widen
 
 
 def sample_bev(
@@ -37,19 +37,14 @@ def sample_bev(
         ValueError: shape, device or ``padding_mode``. TypeError: dtype.
 
     Differentiable twice in ``bev`` and ``grid`` (a third derivative raises). Where the value has a kink, on the lines
-    through cell centres, the derivative is the one towards larger coordinates. Deterministic for any thread count.
+    through cell centres, the derivative is the one towards larger coordinates; at the outermost centres with border
+    padding it is 0, as in ``F.grid_sample``. Deterministic for any thread count.
     """
-    check_shape("sample_bev", "bev", bev, ("B", "C", "H", "W"))
-    check_shape("sample_bev", "grid", grid, (bev.shape[0], "N", 2))
-    check_dtype("sample_bev", "bev", bev, (*FLOATING, torch.bfloat16, torch.float16))
-    check_like("sample_bev", "grid", grid, "bev", bev)
-    check_choice("sample_bev", "padding_mode", padding_mode, ("zeros", "border"))
-    if bev.shape[2] == 0 or bev.shape[3] == 0:
-        raise ValueError(f"sample_bev: bev must have at least one row and column, got {list(bev.shape)}")
-    if _native.use_native("sample_bev", bev):
-        out: Tensor = torch.ops.pred.sample_bev(bev, grid, padding_mode == "border", align_corners)
-        return out
-    return sample_bev_reference(bev, grid, padding_mode, align_corners)
+    if not _native.use_native("sample_bev", bev):
+        return sample_bev_reference(bev, grid, padding_mode, align_corners)
+    bev, grid = _arguments(bev, grid, padding_mode)
+    out: Tensor = torch.ops.pred.sample_bev(bev, grid, padding_mode == "border", align_corners)
+    return out
 
 
 def sample_bev_reference(
@@ -59,8 +54,7 @@ def sample_bev_reference(
     align_corners: bool = False,
 ) -> Tensor:  # [B, N, C]
     """Plain PyTorch form of :func:`sample_bev`: interpolation by its definition, differentiable any number of times."""
-    if torch.is_autocast_enabled(bev.device.type):
-        bev, grid = bev.float(), grid.float()
+    bev, grid = _arguments(bev, grid, padding_mode)
     batch, channels, height, width = bev.shape
     sizes = grid.new_tensor([width, height])
     if align_corners:
@@ -89,6 +83,19 @@ def sample_bev_reference(
             out = out + torch.where(inside[..., None], value, torch.zeros_like(value)) * weight[..., None]
     nan = cell.detach().isnan().any(dim=-1)
     return torch.where(nan[..., None], torch.full_like(out, torch.nan), out)
+
+
+def _arguments(bev: Tensor, grid: Tensor, padding_mode: str) -> tuple[Tensor, Tensor]:
+    op = "sample_bev"
+    bev, grid = widen(bev), widen(grid)
+    check_shape(op, "bev", bev, ("B", "C", "H", "W"))
+    check_shape(op, "grid", grid, (bev.shape[0], "N", 2))
+    check_dtype(op, "bev", bev, FLOATING)
+    check_like(op, "grid", grid, "bev", bev)
+    check_choice(op, "padding_mode", padding_mode, ("zeros", "border"))
+    if bev.shape[2] == 0 or bev.shape[3] == 0:
+        raise ValueError(f"{op}: bev must have at least one row and column, got {list(bev.shape)}")
+    return bev, grid
 
 
 def _fake(bev: Tensor, grid: Tensor, border: bool, align_corners: bool) -> Tensor:

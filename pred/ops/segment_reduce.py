@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, check_choice, check_dtype, check_shape
+from pred.ops._check import FLOATING, check_choice, check_dtype, check_shape, widen
 
 
 def segment_reduce(
@@ -38,24 +38,11 @@ def segment_reduce(
     Differentiable any number of times in ``features``. Of equal maxima the first row takes the gradient; with NaN
     present it is the first NaN. Deterministic for any thread count: rows are added in their order.
     """
-    check_shape("segment_reduce", "features", features, ("N", "C"))
-    check_shape("segment_reduce", "index", index, (features.shape[0],), " as features")
-    autocast = torch.is_autocast_enabled(features.device.type)
-    check_dtype(
-        "segment_reduce", "features", features, (*FLOATING, torch.bfloat16, torch.float16) if autocast else FLOATING
-    )
-    check_dtype("segment_reduce", "index", index, (torch.int64,))
-    check_choice("segment_reduce", "reduce", reduce, ("sum", "mean", "max"))
-    if index.device != features.device:
-        raise ValueError(
-            f"segment_reduce: index must be on the device of features ({features.device}), got {index.device}"
-        )
-    if num_segments < 0:
-        raise ValueError(f"segment_reduce: num_segments must not be negative, got {num_segments}")
-    if _native.use_native("segment_reduce", features):
-        out: Tensor = torch.ops.pred.segment_reduce(features, index, num_segments, reduce)[0]
-        return out
-    return segment_reduce_reference(features, index, num_segments, reduce)
+    if not _native.use_native("segment_reduce", features):
+        return segment_reduce_reference(features, index, num_segments, reduce)
+    features = _arguments(features, index, num_segments, reduce)
+    out: Tensor = torch.ops.pred.segment_reduce(features, index, num_segments, reduce)[0]
+    return out
 
 
 def segment_reduce_reference(
@@ -65,8 +52,7 @@ def segment_reduce_reference(
     reduce: str = "sum",
 ) -> Tensor:  # [num_segments, C]
     """Plain PyTorch form of :func:`segment_reduce`, differentiable any number of times."""
-    if torch.is_autocast_enabled(features.device.type):
-        features = features.float()
+    features = _arguments(features, index, num_segments, reduce)
     if not torch.compiler.is_compiling() and index.device.type == "cpu":
         _check_index(index, num_segments)
     # One more segment takes the skipped rows.
@@ -78,6 +64,21 @@ def segment_reduce_reference(
         return total
     count = features.new_zeros(num_segments + 1).index_add(0, segment, features.new_ones(features.shape[0]))[:-1]
     return total / count.clamp_min(1)[:, None]
+
+
+def _arguments(features: Tensor, index: Tensor, num_segments: int, reduce: str) -> Tensor:
+    op = "segment_reduce"
+    features = widen(features)
+    check_shape(op, "features", features, ("N", "C"))
+    check_shape(op, "index", index, (features.shape[0],), " as features")
+    check_dtype(op, "features", features, FLOATING)
+    check_dtype(op, "index", index, (torch.int64,))
+    check_choice(op, "reduce", reduce, ("sum", "mean", "max"))
+    if index.device != features.device:
+        raise ValueError(f"{op}: index must be on the device of features ({features.device}), got {index.device}")
+    if num_segments < 0:
+        raise ValueError(f"{op}: num_segments must not be negative, got {num_segments}")
+    return features
 
 
 def _max_reference(features: Tensor, segment: Tensor, num_segments: int) -> Tensor:

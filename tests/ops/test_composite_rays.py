@@ -320,10 +320,11 @@ def test_empty(backend: str, shape: tuple[int, int], channels: int) -> None:
     assert not found["depth"].any() and not found["opacity"].any() and not found["values"].any()
 
 
-def test_negative_sharpness_is_nan(backend: str) -> None:
+@pytest.mark.parametrize("wrong", [-1.0, torch.inf, torch.nan])
+def test_sharpness_is_checked(backend: str, wrong: float) -> None:
     sdf, _, t, values = case()
-    out = composite_rays(sdf, torch.tensor(-1.0, dtype=torch.float64), t, values)
-    assert out.depth.isnan().all() and out.values is not None and out.values.isnan().all()
+    with pytest.raises(ValueError, match="composite_rays: inv_s must be finite and not negative, got -?(1|inf|nan)"):
+        composite_rays(sdf, torch.tensor(wrong, dtype=torch.float64), t, values)
 
 
 def test_layouts_agree(backend: str) -> None:
@@ -351,8 +352,8 @@ def test_errors(backend: str) -> None:
         composite_rays(sdf, inv_s, t, depth_at="end")
     with pytest.raises(ValueError, match=r"composite_rays: inv_s must have one element, got shape \[2\]"):
         composite_rays(sdf, torch.ones(2, dtype=torch.float64), t)
-    with pytest.raises(ValueError, match="composite_rays: inv_s must be above 0"):
-        composite_rays(sdf, 0.0, t)
+    with pytest.raises(ValueError, match="composite_rays: inv_s must be finite and not negative"):
+        composite_rays(sdf, -1.0, t)
 
 
 def test_autocast_computes_in_float32(backend: str) -> None:

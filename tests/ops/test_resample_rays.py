@@ -112,6 +112,30 @@ def test_levels_agree(level: str, shape: tuple[int, int, int], spread: str, dtyp
     assert_close(actual.double(), expected, 2e-5 if dtype == torch.float32 else 1e-12)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_no_old_sample_is_lost(level: str, dtype: torch.dtype) -> None:
+    """Sums of weights like 0.3 and 0.6 may fall by a rounding where sections are empty."""
+    generator = torch.Generator().manual_seed(11)
+    weights = torch.randint(0, 7, (4000, 21), generator=generator).to(dtype) / 10
+    weights = torch.where(torch.rand(weights.shape, generator=generator) < 0.5, 0, weights)
+    weights[0] = torch.tensor([0.3, 0.4, 0.6, 0.0, 0.1] + 16 * [0.0])
+    t = torch.arange(22, dtype=dtype).expand(4000, -1)
+    noise = torch.rand(1, 1, generator=generator, dtype=dtype)
+    for u in (None, (torch.arange(33) + noise) / 33, torch.rand(4000, 33, generator=generator, dtype=dtype)):
+        u = None if u is None else u.expand(4000, -1).sort(dim=1).values
+        merged = resample_rays(t, weights, 33, u)
+        found = torch.searchsorted(merged, t.contiguous()).clamp(max=merged.shape[1] - 1)
+        assert torch.equal(merged.gather(1, found), t)
+        assert (merged.diff(dim=1) >= 0).all()
+
+
+def test_last_position_belongs_to_the_last_weight(level: str) -> None:
+    """u = 1 is clipped below 1, and so lies before the empty sections at the end."""
+    t = torch.arange(5.0)[None]
+    out = resample_rays(t, torch.tensor([[1.0, 1.0, 0.0, 0.0]]), 4, (torch.arange(4.0) + 1) / 4)[0]
+    assert out.tolist() == pytest.approx([0.0, 0.5, 1.0, 1.0, 1.5, 2.0, 2.0, 3.0, 4.0])
+
+
 def test_result_is_sorted_and_keeps_the_old_samples(backend: str) -> None:
     t, weights = case(20, 96, torch.float32)
     out = resample_rays(t, weights, 128)

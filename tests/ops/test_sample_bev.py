@@ -193,6 +193,10 @@ def test_errors(backend: str) -> None:
         sample_bev(bev, grid.float())
     with pytest.raises(TypeError, match="sample_bev: bev must be float32 or float64"):
         sample_bev(bev.long(), grid.long())
+    with pytest.raises(TypeError, match="sample_bev: bev must be float32 or float64, got bfloat16"):
+        sample_bev(bev.bfloat16(), grid.bfloat16())
+    with torch.autocast("cpu", torch.bfloat16), pytest.raises(TypeError, match="grid must have the dtype of bev"):
+        sample_bev(bev.float(), grid.double())
     with pytest.raises(ValueError, match="sample_bev: padding_mode must be one of zeros, border"):
         sample_bev(bev, grid, "reflection")
     with pytest.raises(ValueError, match="at least one row and column"):

@@ -81,12 +81,19 @@ def test_float32_is_accurate_where_it_is_small(level: str, inv_s: float) -> None
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_extreme_sharpness(backend: str, dtype: torch.dtype) -> None:
-    """The clip range of common parametrisations, 1e-6 to 1e6; below 0 everything is NaN, on all backends."""
+    """The clip range of common parametrisations, 1e-6 to 1e6, and 0."""
     sdf = torch.tensor([[2.0, 1.0, -1.0, -2.0, 3.0]], dtype=dtype)
     soft = sdf_to_alpha(sdf, torch.tensor(1e-6, dtype=dtype))[0]
     assert soft.tolist() == pytest.approx([5e-7, 1e-6, 5e-7, 0.0, 0.0], rel=2e-6)
     assert sdf_to_alpha(sdf, torch.tensor(1e6, dtype=dtype))[0].tolist() == [0.0, 1.0, 1.0, 0.0, 0.0]
-    assert sdf_to_alpha(sdf, torch.tensor(-1.0, dtype=dtype))[0, :-1].isnan().all()
+    assert sdf_to_alpha(sdf, torch.tensor(0.0, dtype=dtype))[0].tolist() == [0.0] * 5
+
+
+@pytest.mark.parametrize("wrong", [-1.0, torch.inf, torch.nan])
+@pytest.mark.parametrize("as_tensor", [False, True])
+def test_sharpness_is_checked(backend: str, wrong: float, as_tensor: bool) -> None:
+    with pytest.raises(ValueError, match="sdf_to_alpha: inv_s must be finite and not negative, got -?(1|inf|nan)"):
+        sdf_to_alpha(torch.zeros(1, 2), torch.tensor(wrong) if as_tensor else wrong)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -179,7 +186,7 @@ def test_errors(backend: str) -> None:
         sdf_to_alpha(sdf, 2.7, mode="section")
     with pytest.raises(ValueError, match="sdf_to_alpha: last must be one of zero, opaque"):
         sdf_to_alpha(sdf, 2.7, last="one")
-    with pytest.raises(ValueError, match="sdf_to_alpha: inv_s must be above 0 and finite, got -1"):
+    with pytest.raises(ValueError, match="sdf_to_alpha: inv_s must be finite and not negative, got -1"):
         sdf_to_alpha(sdf, -1.0)
     with pytest.raises(ValueError, match=r"sdf_to_alpha: sdf must have shape \[R, S\], got \[4\]"):
         sdf_to_alpha(sdf[0], 2.7)
