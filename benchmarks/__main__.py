@@ -61,6 +61,7 @@ def main() -> None:
     report = run(options)
     if not options.quiet:
         report.show()
+        print(f"\nwritten: {report.out}")
     if any(row.status.startswith("wrong") for row in report.rows):
         sys.exit("some contender differs from the reference: see the rows marked 'wrong'")
 
@@ -86,7 +87,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         "--min-time", type=float, default=0.6, metavar="S", help="seconds per contender and phase (default 0.6)"
     )
     parser.add_argument("--quick", action="store_true", help="a fifth of the time, three rounds, one allocator")
-    parser.add_argument("--out", type=Path, default=None, metavar="JSON", help="write everything to this file")
+    parser.add_argument(
+        "--out", type=Path, default=None, metavar="JSON", help="the record; default: benchmarks/results/<UTC time>.json"
+    )
     parser.add_argument(
         "--default-allocator", action="store_true", help="leave malloc's thresholds as they are, in this run only"
     )
@@ -94,6 +97,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     options = parser.parse_args(arguments)
     if not options.min_time > 0:
         parser.error(f"--min-time must be above 0, got {options.min_time}")
+    options.out = options.out or Path(time.strftime("benchmarks/results/%Y%m%dT%H%M%SZ.json", time.gmtime()))
     options.threads = options.threads or sorted({1, torch.get_num_threads()})
     options.rounds = 3 if options.quick else ROUNDS
     if options.quick:
@@ -176,7 +180,7 @@ class Report:
         self.rows: list[Row] = []
         self.ceilings: dict[int, Ceilings] = {}
         self.default_allocator: dict[str, Any] | None = None
-        self._out: Path | None = options.out
+        self.out: Path = options.out
         self._start_time = time.monotonic()
         self._head: dict[str, Any] = {
             "command": shlex.join(["python", "-m", "benchmarks", *sys.argv[1:]]),
@@ -190,9 +194,7 @@ class Report:
         }
 
     def write(self, complete: bool = False) -> None:
-        """Replaces the file, if one was asked for."""
-        if self._out is None:
-            return
+        """Replaces the record."""
         content = {
             "schema": SCHEMA,
             "complete": complete,
@@ -203,10 +205,10 @@ class Report:
             "comparisons": compare(self.rows, self.ceilings),
             "default_allocator": self.default_allocator,
         }
-        self._out.parent.mkdir(parents=True, exist_ok=True)
-        partial = self._out.with_name(self._out.name + ".part")
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        partial = self.out.with_name(self.out.name + ".part")
         partial.write_text(json.dumps(content, indent=1) + "\n")
-        partial.replace(self._out)
+        partial.replace(self.out)
 
     def show(self) -> None:
         """Prints the tables."""

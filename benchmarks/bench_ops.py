@@ -236,6 +236,8 @@ def _compare(actual: list[Tensor], expected: list[Tensor], case: Case) -> tuple[
             return math.inf, f"result {number} has shape {list(have.shape)}, not {list(want.shape)}"
         if want.numel() == 0:
             continue
+        if not torch.equal(have.isnan(), want.isnan()):
+            return math.inf, f"result {number} is NaN in other places"
         difference = (have - want).abs().double() / want.abs().max().double().clamp_min(1e-30)
         worst = max(worst, float(difference.max()))
         missed = float((~(difference <= case.tolerance)).double().mean())

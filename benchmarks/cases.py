@@ -1,6 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs with real LiDAR sizes, and a tiny variant of each; tests and benchmarks share them.
+"""Inputs with real LiDAR sizes, and a tiny variant of each.
 
 All are float32, made from a seed, and shaped like what the ops meet in training: points of a spinning LiDAR in firing
 order, BEV samples along rays, signed distances that cross one surface per ray.

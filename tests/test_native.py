@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -61,7 +62,9 @@ def test_other_devices_take_the_reference_with_one_warning(monkeypatch: pytest.M
     bev, grid = torch.zeros(1, 1, 1, 1, device="meta"), torch.zeros(1, 1, 2, device="meta")
     with pytest.warns(RuntimeWarning, match="sample_bev: no meta kernel yet; the PyTorch reference is used"):
         assert not _native.use_native("sample_bev", bev)
-    assert not _native.use_native("sample_bev", bev)  # a second warning would be an error
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not _native.use_native("sample_bev", bev)
     monkeypatch.setenv("PRED_BACKEND", "native")
     with pytest.raises(RuntimeError, match="sample_bev: PRED_BACKEND=native, but there is no kernel for device 'meta'"):
         sample_bev(bev, grid)
