@@ -57,10 +57,10 @@ SANITIZE := $(CURDIR)/build/sanitize
 sanitize: $(VENV)/dev.stamp
 	rm -rf $(SANITIZE)
 	PRED_SANITIZE=address,undefined PRED_REQUIRE_NATIVE=1 $(PIP) install --no-deps --no-build-isolation --target $(SANITIZE) .
-	export PYTHONPATH=$(SANITIZE):$(CURDIR) PRED_REQUIRE_NATIVE=1 ASAN_OPTIONS=detect_leaks=0 \
-		LD_PRELOAD="$$(g++ -print-file-name=libasan.so):$$(g++ -print-file-name=libubsan.so)"; \
-	cd $(SANITIZE) && $(abspath $(BIN))/python -c "from pred._native import native_status as s; assert s()['build']['sanitizers'], s()" && \
-	cd $(CURDIR) && $(BIN)/pytest -p no:cacheprovider -k "not reference" tests/ops
+	PYTHONPATH=$(SANITIZE) PRED_TEST_SANITIZED=1 PRED_REQUIRE_NATIVE=1 ASAN_OPTIONS=detect_leaks=0 \
+		LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so):$$($(CXX) -print-file-name=libubsan.so)" \
+		$(BIN)/python -m pytest -p no:cacheprovider -o pythonpath="$(SANITIZE) ." \
+		tests/ops tests/test_native.py tests/data/test_sweeps.py
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .

@@ -14,6 +14,13 @@ import torch
 from pred import _native
 
 LEVELS = ("default", "avx2", "avx512", "avx512_bf16")
+SANITIZED = os.environ.get("PRED_TEST_SANITIZED") == "1"
+"""The run is to find memory errors in the compiled code; tests of a reference alone are left out."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if SANITIZED and not _native.native_status()["build"].get("sanitizers"):
+        raise pytest.UsageError(f"{_native.native_status()['path']} was not built with sanitizers")
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +31,7 @@ def _threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-@pytest.fixture(params=["native", "reference"])
+@pytest.fixture(params=["native"] if SANITIZED else ["native", "reference"])
 def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Runs the test on the compiled kernels and on the references."""
     if request.param == "native":
