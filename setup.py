@@ -62,14 +62,22 @@ def find_torch() -> tuple[Path, str]:
     )
 
 
-def find_tool(name: str, variable: str | None = None, others: tuple[str, ...] = ()) -> str:
+def find_tool(name: str, others: tuple[str, ...] = ()) -> str:
     """Path of a build tool."""
-    wanted = os.environ.get(variable) if variable else None
-    for candidate in (wanted,) if wanted else (name, *others):
-        path = shutil.which(candidate.split()[0])
+    for candidate in (name, *others):
+        path = shutil.which(candidate)
         if path:
             return path
-    raise MissingToolError(f"{wanted or name} was not found on PATH; install it, then install this package again")
+    raise MissingToolError(f"{name} was not found on PATH; install it, then install this package again")
+
+
+def compiler_options() -> list[str]:
+    """CMake options that name the C++ compiler; CMake reads CXX, with arguments, by itself."""
+    wanted = os.environ.get("CXX")
+    if not wanted:
+        return [f"-DCMAKE_CXX_COMPILER={find_tool('c++', ('g++', 'clang++'))}"]
+    find_tool(wanted.split()[0])
+    return []
 
 
 def pybind11_options() -> list[str]:
@@ -104,7 +112,7 @@ class CMakeBuild(build_ext):
             raise SystemExit("PRED_CUDA=1: this version has no CUDA library yet; CUDA tensors use the references")
         torch_dir, torch_version = find_torch()
         cmake, ninja = find_tool("cmake"), find_tool("ninja")
-        compiler = find_tool("c++", "CXX", ("g++", "clang++"))
+        compiler = compiler_options()
         debug = os.environ.get("DEBUG") == "1"
         sanitize = os.environ.get("PRED_SANITIZE", "")
         build = Path(self.build_temp).resolve() / ("sanitize" if sanitize else "debug" if debug else "release")
@@ -115,7 +123,7 @@ class CMakeBuild(build_ext):
         configure = [
             cmake, "-G", "Ninja", "-S", str(ROOT), "-B", str(build),
             f"-DCMAKE_MAKE_PROGRAM={ninja}",
-            f"-DCMAKE_CXX_COMPILER={compiler}",
+            *compiler,
             f"-DCMAKE_BUILD_TYPE={'RelWithDebInfo' if debug or sanitize else 'Release'}",
             f"-DCMAKE_INSTALL_PREFIX={package}",
             f"-DPRED_TORCH_DIR={torch_dir}",
