@@ -91,7 +91,7 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a sub-command; returns the exit status (0 done, 1 failed, 2 wrong usage)."""
     # Read by torch's OpenMP library when torch is imported. Its threads wait for each other in a busy loop, by default
-    # so long that a step takes ten times as long where another program wants a core; this costs 4 % where none does.
+    # so long that a step takes many times as long where another program wants a core.
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     name = arguments.pop(0) if arguments else "--help"

@@ -15,6 +15,7 @@ import torch
 
 import pred
 from pred._native import native_status
+from pred.data.sweeps import HOST_ERROR
 
 EXTRAS = {
     # module to look for: (extra, what it is for)
@@ -60,10 +61,8 @@ def _kernels() -> list[tuple[str, str]]:
     else:
         lines.append(("instruction set", f"{status['cpu_capability']} ({_capability_source()})"))
     lines += [(f"build {name}", str(value)) for name, value in status["build"].items()]
-    if importlib.util.find_spec("pred._host") is None:
-        lines.append(("pred._host", "absent (optional: NumPy helpers for loader workers)"))
-    else:
-        lines.append(("pred._host", "present"))
+    host = "loaded" if HOST_ERROR is None else f"not used, loader workers take NumPy instead: {HOST_ERROR}"
+    lines.append(("pred._host", host))
     return lines
 
 

@@ -94,7 +94,9 @@ def evaluate_rendering(
     num_frames = min(len(source), max_frames or len(source))
     with Progress("evaluated frame", num_frames) as progress:
         for frame in load_frames(source, num_frames, config.data.on_error == "skip", skipped):
-            batch = evaluation_batch(frame, config.data, config.point_range, config.train.seed).to(device)
+            batch = evaluation_batch(
+                frame, config.data, config.point_range, config.train.seed, config.renderer.near_m
+            ).to(device)
             for name, network in networks.items():
                 add_scores(scores[name], network, batch)
             rays = batch.depth

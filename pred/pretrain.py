@@ -28,6 +28,7 @@ from pred import __version__
 from pred.checkpoint import CheckpointError, LatestCheckpoint, load_latest, load_tensors, save_checkpoint, save_tensors
 from pred.config import flatten, plain, to_yaml
 from pred.data.batch import Batch, DataConfig, PointRange, TrainingBatches, build_source, make_loader
+from pred.data.frame import NUM_CLASSES
 from pred.losses import LossConfig
 from pred.models.encoders.pillars import PillarEncoderConfig
 from pred.models.field import FieldConfig
@@ -38,10 +39,10 @@ from pred.random import seed_of
 from pred.run_folder import CsvLog, RunFolder
 
 FREE_KEYS = {
-    "run", "data.root", "data.workers", "train.accelerator", "train.devices", "train.num_nodes", "train.log_every",
+    "run", "data.root", "data.workers", "train.accelerator", "train.log_every",
     "train.checkpoint_every", "train.keep_checkpoints",
 }  # fmt: skip
-"""Keys that a resumed run may change: they leave its bits alone, or lie with the user (devices)."""
+"""Keys that a resumed run may change: they leave its bits alone, or lie with the user (accelerator)."""
 
 RECALIBRATION_BATCHES = 16
 """Batches whose average makes the final batch normalisation statistics; 4 and 64 were found to do as well."""
@@ -55,7 +56,7 @@ class TrainConfig:
     epochs: float = 45.0
     """Passes over the data set; ignored where `steps` is given."""
     steps: int | None = None
-    """Optimiser steps; None: epochs x frames / batch size."""
+    """Optimiser steps; None: epochs x frames / (batch size x processes)."""
     lr: float = 3e-4
     """Largest learning rate of the one-cycle schedule."""
     weight_decay: float = 0.01
@@ -75,15 +76,11 @@ class TrainConfig:
     seed: int = 0
     """Of the initial weights and of all sampling."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
-    """bf16-mixed: matrix products in bfloat16, weights in float32."""
+    """bf16-mixed: the convolutions of the encoder's 2D backbone in bfloat16, all else in float32."""
     deterministic: bool = True
     """Use only algorithms that repeat bit for bit (needed for an exact resume on CUDA)."""
     accelerator: str = "auto"
-    """Lightning Fabric: auto, cpu, cuda."""
-    devices: int | str = "auto"
-    """Lightning Fabric: devices per machine; several are started by torchrun."""
-    num_nodes: int = 1
-    """Lightning Fabric: machines."""
+    """Lightning Fabric: auto, cpu, cuda. One device per process; torchrun starts several."""
     log_every: int = 10
     """Steps between rows of log.csv, timing.csv and TensorBoard."""
     checkpoint_every: int = 250
@@ -92,7 +89,7 @@ class TrainConfig:
     """Checkpoints kept."""
 
     def __post_init__(self) -> None:
-        for name in ("log_every", "checkpoint_every", "keep_checkpoints", "num_nodes"):
+        for name in ("log_every", "checkpoint_every", "keep_checkpoints"):
             if getattr(self, name) < 1:
                 raise ValueError(f"train.{name} must be at least 1, got {getattr(self, name)}")
         for name in ("lr", "epochs", "grad_clip"):
@@ -121,11 +118,17 @@ class PretrainConfig:
     point_range: PointRange = (-51.2, -51.2, -5.0, 51.2, 51.2, 3.0)
     """Range box (x_min, y_min, z_min, x_max, y_max, z_max), metres, LiDAR frame."""
     data: DataConfig = dataclasses.field(default_factory=DataConfig)
+    """What is read, what is hidden from the encoder, and how many rays are drawn."""
     encoder: PillarEncoderConfig = dataclasses.field(default_factory=PillarEncoderConfig)
+    """Sizes of the pillar encoder."""
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+    """Sizes of the decoder from BEV features to signed distance and semantics."""
     renderer: RendererConfig = dataclasses.field(default_factory=RendererConfig)
+    """Sampling and compositing along a ray."""
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
+    """Weights of the loss terms."""
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
+    """Length, optimiser, precision, logging."""
 
     def __post_init__(self) -> None:
         lower, upper = self.point_range[:3], self.point_range[3:]
@@ -133,6 +136,8 @@ class PretrainConfig:
             raise ValueError(
                 f"point_range must be (x_min, y_min, z_min, x_max, y_max, z_max) in metres, got {self.point_range}"
             )
+        if self.field.num_classes != NUM_CLASSES:
+            raise ValueError(f"field.num_classes must be the labels' {NUM_CLASSES}, got {self.field.num_classes}")
 
 
 class NonFiniteLossError(RuntimeError):
@@ -161,7 +166,14 @@ def pretrain(config: PretrainConfig, resume: bool = False) -> Path:
     source = build_source(config.data)
     total_steps = train.steps or math.ceil(train.epochs * len(source) / (config.data.batch_size * fabric.world_size))
     batches = TrainingBatches(
-        config.data, config.point_range, train.seed, total_steps, fabric.global_rank, fabric.world_size, source
+        config.data,
+        config.point_range,
+        train.seed,
+        total_steps,
+        fabric.global_rank,
+        fabric.world_size,
+        source,
+        config.renderer.near_m,
     )
     model = build_model(config)
 
@@ -231,7 +243,7 @@ def pretrain(config: PretrainConfig, resume: bool = False) -> Path:
             optimizer.step()
             step += 1
 
-            for token, reason in batch.skipped.items():
+            for token, reason in batch.skipped:
                 skipped_frames += 1
                 progress.message(f"skipped frame {token}: {reason}")
             duration_s, start_time = time.monotonic() - start_time, time.monotonic()
@@ -273,13 +285,14 @@ def launch_fabric(train: TrainConfig) -> Fabric:
         torch.use_deterministic_algorithms(True)
         # Filling fresh memory with NaN costs time; that nothing reads it is for the tests to show.
         torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
-    # Without labels, or in a batch without labelled pixels, the semantic head gets no gradient.
-    many = int(os.environ.get("WORLD_SIZE", "1")) > 1
+    # Set by torchrun.
+    world_size, per_machine = (int(os.environ.get(name, "1")) for name in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))
     fabric = Fabric(
         accelerator=train.accelerator,
-        devices=train.devices,
-        num_nodes=train.num_nodes,
-        strategy="ddp_find_unused_parameters_true" if many else "auto",
+        devices=per_machine,
+        num_nodes=world_size // per_machine,
+        # Without labels, or in a batch without labelled pixels, the semantic head gets no gradient.
+        strategy="ddp_find_unused_parameters_true" if world_size > 1 else "auto",
     )
     fabric.launch()
     return fabric

@@ -12,7 +12,6 @@ import hashlib
 from numbers import Integral
 
 import numpy as np
-import torch
 
 
 def seed_of(seed: int, *key: int | str) -> int:
@@ -37,8 +36,3 @@ def seed_of(seed: int, *key: int | str) -> int:
 def numpy_generator(seed: int, *key: int | str) -> np.random.Generator:
     """NumPy generator (Philox) of ``(seed, *key)``."""
     return np.random.Generator(np.random.Philox(key=seed_of(seed, *key)))
-
-
-def torch_generator(seed: int, *key: int | str) -> torch.Generator:
-    """CPU torch generator of ``(seed, *key)``."""
-    return torch.Generator().manual_seed(seed_of(seed, *key))

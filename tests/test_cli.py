@@ -148,6 +148,7 @@ def test_unknown_key_in_a_file_names_the_nearest(
     [
         (["--data.batch_size", "many"], "data.batch_size"),
         (["--data.dataset", "kitti"], "data.dataset"),
+        (["--data.depth_view", "camera"], "data.depth_view"),
         (["--train.precision", "16"], "train.precision"),
         (["--point_range", "[1, 2]"], "point_range"),
     ],
@@ -161,6 +162,13 @@ def test_rule_between_fields_is_an_error_in_one_line(capfd: pytest.CaptureFixtur
     error = capfd.readouterr().err
     assert "pred pretrain: error: data.mask_ratio must be in [0, 1), got 1.5" in error and "Traceback" not in error
     assert not (tmp_path / "run").exists()
+
+
+def test_street_labels_are_auto_or_none(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert parse("--config=demo", "--data.labels=none").data.labels == "none"
+    options = ["--config", "demo", "--data.labels", "pseudo/x", "--run", str(tmp_path / "run")]
+    assert cli.main(["pretrain", *options]) == 1
+    assert "data.labels must be auto or none for the street, got 'pseudo/x'" in capfd.readouterr().err
 
 
 def test_traceback_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -330,6 +338,15 @@ def test_doctor_says_which_backend_and_why(
     assert lines["backend"] == expected
     assert ("remedy" in lines) == (not available)
     assert ("no compiler was found" in lines["library"]) == (not available)
+
+
+def test_doctor_says_why_the_host_module_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A file that exists but does not load must not look present.
+    monkeypatch.setattr(doctor, "HOST_ERROR", "_host.so: undefined symbol: f")
+    host = dict(dict(doctor.report())["kernels"])["pred._host"]
+    assert host == "not used, loader workers take NumPy instead: _host.so: undefined symbol: f"
+    monkeypatch.setattr(doctor, "HOST_ERROR", None)
+    assert dict(dict(doctor.report())["kernels"])["pred._host"] == "loaded"
 
 
 def test_doctor_names_the_pip_command_of_a_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:

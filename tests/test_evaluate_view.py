@@ -26,6 +26,7 @@ from pred.view import (
     CLASS_COLOURS,
     FARTHEST_M,
     NEAREST_M,
+    blank,
     class_colours,
     dimmed,
     distance_colours,
@@ -38,6 +39,7 @@ from pred.view import (
     sdf_colours,
     view,
 )
+from tests.data.tiny_tree import write_tree
 
 
 @pytest.fixture(scope="module")
@@ -161,19 +163,19 @@ def test_nothing_to_measure_gives_none_and_no_warning() -> None:
     assert results_table(result).row_count == 5
 
 
-def without_labels(frame: Frame) -> Frame:
-    for camera in frame.cameras:
-        camera.labels = None
-    return frame
-
-
 def test_lidar_only_run_is_evaluated_and_viewed(config: PretrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    load = StreetFrames.load
-    monkeypatch.setattr(StreetFrames, "load", lambda self, index: without_labels(load(self, index)))
+    monkeypatch.setattr(config.data, "labels", "none")
     result = evaluate_rendering(config, run_of(config), max_frames=1)
     assert result["semantic_rays"] == 0 and result["trained"]["semantic_accuracy"] is None
     assert result["trained"]["depth_median_m"] > 0
     assert len(view(config, run_of(config), columns=8)) == 7
+
+
+def test_rays_nearer_than_near_m_are_not_evaluated(config: PretrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    everything = evaluate_rendering(config, run_of(config), max_frames=1)
+    monkeypatch.setattr(config.renderer, "near_m", 8.0)
+    far = evaluate_rendering(config, run_of(config), max_frames=1)
+    assert 0 < far["depth_rays"] < everything["depth_rays"]
 
 
 def test_broken_frames_are_skipped_on_request(config: PretrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -216,6 +218,25 @@ def test_view_writes_a_picture_per_camera_and_one_from_above(
         colours = {colour for _, colour in picture.crop((656, 48, 1296, 408)).getcolors(1 << 24)}
     road = tuple(CLASS_COLOURS[0].tolist())
     assert road in colours and colours <= {tuple(colour) for colour in CLASS_COLOURS.tolist()} | {(0, 0, 0)}
+
+
+def test_lidar_only_view_without_image_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = write_tree(tmp_path / "data")
+    for image in (image for images in tree.images for image in images.values()):
+        image.unlink()
+    config = tiny_config(tmp_path / "run", steps=1)
+    config.data.dataset, config.data.root, config.data.labels = "nuscenes", str(tree.root), "none"
+    pretrain(config)
+    texts = []
+
+    def noted_blank(size: tuple[int, int], text: str) -> Image.Image:
+        texts.append(text)
+        return blank(size, text)
+
+    monkeypatch.setattr("pred.view.blank", noted_blank)
+    names = [path.name for path in view(config, run_of(config), columns=8)]
+    assert names == ["000000_CAM_BACK.png", "000000_CAM_FRONT.png", "000000_bev.png"]
+    assert texts.count("no image") == texts.count("no pseudo label") == 2
 
 
 def test_pixel_rays_point_at_their_pixels(config: PretrainConfig) -> None:

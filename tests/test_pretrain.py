@@ -14,16 +14,23 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import docstring_parser
 import pytest
 import torch
 from tiny_run import tiny_config, write_config
 from torch import Tensor
 
 from pred.checkpoint import CheckpointError, list_checkpoints, load_tensors
-from pred.data.batch import TrainingBatches
+from pred.data.batch import DataConfig, TrainingBatches
+from pred.data.frame import FrameError
+from pred.data.world import StreetConfig
+from pred.losses import LossConfig
+from pred.models.encoders.pillars import PillarEncoderConfig
+from pred.models.field import FieldConfig
 from pred.models.pretrainer import Pretrainer
+from pred.models.renderer import RendererConfig
 from pred.pretrain import (
     NonFiniteLossError,
     PretrainConfig,
@@ -36,6 +43,7 @@ from pred.pretrain import (
     set_schedule,
 )
 from pred.run_folder import CsvLog, RunFolder, RunFolderError
+from tests.data.tiny_tree import write_tree
 
 
 @pytest.fixture(autouse=True)
@@ -63,17 +71,17 @@ def weights(run: Path) -> dict[str, Tensor]:
     return model
 
 
-def assert_same_run(left: Path, right: Path) -> None:
-    """Equal weights, optimiser state and log, bit for bit."""
+def assert_same_run(left: Path, right: Path, note: str = "") -> None:
+    """Equal weights, optimiser state and log, bit for bit; a failure shows ``note``."""
     states = [load_tensors(list_checkpoints(run / "checkpoints")[-1]) for run in (left, right)]
-    assert states[0]["step"] == states[1]["step"]
-    assert states[0]["model"].keys() == states[1]["model"].keys()
+    assert states[0]["step"] == states[1]["step"], note
+    assert states[0]["model"].keys() == states[1]["model"].keys(), note
     for name, tensor in states[0]["model"].items():
-        assert torch.equal(tensor, states[1]["model"][name]), name
+        assert torch.equal(tensor, states[1]["model"][name]), (name, note)
     for index, moments in states[0]["optimizer"]["state"].items():
         for name, tensor in moments.items():
-            assert torch.equal(tensor, states[1]["optimizer"]["state"][index][name]), (index, name)
-    assert (left / "log.csv").read_bytes() == (right / "log.csv").read_bytes()
+            assert torch.equal(tensor, states[1]["optimizer"]["state"][index][name]), (index, name, note)
+    assert (left / "log.csv").read_bytes() == (right / "log.csv").read_bytes(), note
 
 
 # The run folder
@@ -181,6 +189,8 @@ def test_killed_at_random_steps_and_resumed_equals_uninterrupted(tmp_path: Path)
     subprocess.run(command("--config", config_file, "--run", whole), env=environment, check=True, capture_output=True)
 
     first, second = sorted(random.Random().sample(range(2, steps - 10), 2))
+    killed_at = f"killed at steps {first} and {second}"
+    print(killed_at)  # for failures of the commands themselves
     # Loader processes must not matter, so only the broken run has one.
     start = command("--config", config_file, "--run", broken, "--data.workers", "1")
     run_and_kill(start, broken, first, environment)
@@ -188,12 +198,12 @@ def test_killed_at_random_steps_and_resumed_equals_uninterrupted(tmp_path: Path)
     last = subprocess.run(
         command("--resume", broken), env=environment, check=True, capture_output=True, text=True
     ).stdout
-    assert "resumed from" in last or first < 7, last
-    assert_same_run(whole, broken)
+    assert "resumed from" in last or first < 7, f"{killed_at}: {last}"
+    assert_same_run(whole, broken, killed_at)
     # The kill may come between the two files, so only the steps must agree.
     timed = [row["step"] for row in read_log(broken, "timing.csv")]
-    assert timed == sorted(set(timed), key=int)
-    assert len(json.loads((broken / "run.json").read_text())["resumed"]) == 2
+    assert timed == sorted(set(timed), key=int), killed_at
+    assert len(json.loads((broken / "run.json").read_text())["resumed"]) == 2, killed_at
 
 
 def test_resume_uses_the_previous_checkpoint_if_the_newest_is_damaged(
@@ -315,20 +325,42 @@ def test_bf16_trains_with_weights_in_float32(tmp_path: Path) -> None:
     assert all(math.isfinite(float(row["loss"])) for row in read_log(run))
 
 
-def test_lidar_only_by_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pred.data.world import StreetFrames
-
-    load = StreetFrames.load
-
-    def load_without_labels(self: StreetFrames, index: int) -> Any:
-        frame = load(self, index)
-        for camera in frame.cameras:
-            camera.labels = None
-        return frame
-
-    monkeypatch.setattr(StreetFrames, "load", load_without_labels)
-    rows = read_log(pretrain(tiny_config(tmp_path / "run", steps=2)))
+@pytest.mark.parametrize("dataset", ["street", "nuscenes"])
+def test_lidar_only_by_configuration(tmp_path: Path, dataset: Literal["street", "nuscenes"]) -> None:
+    config = tiny_config(tmp_path / "run", steps=2)
+    config.data.dataset, config.data.labels = dataset, "none"
+    if dataset == "nuscenes":
+        config.data.root = str(write_tree(tmp_path / "data").root)
+    rows = read_log(pretrain(config))
     assert [row["semantic"] for row in rows] == ["0.0", "0.0"] and float(rows[0]["depth"]) > 0
+
+
+def test_returns_nearer_than_near_m_are_no_targets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nearest_m = []
+    forward = Pretrainer.forward
+
+    def watched_forward(self: Pretrainer, batch: Any) -> Any:
+        nearest_m.append(float(batch.depth.depth_m[batch.depth.valid].min()))
+        return forward(self, batch)
+
+    monkeypatch.setattr(Pretrainer, "forward", watched_forward)
+    config = tiny_config(tmp_path / "run", steps=2)
+    config.renderer.near_m = 8.0
+    pretrain(config)
+    assert len(nearest_m) == 2 and min(nearest_m) > 8.0
+
+
+def test_every_skipped_frame_is_counted(tmp_path: Path) -> None:
+    tree = write_tree(tmp_path / "data")
+    for image in tree.images[1].values():
+        image.write_bytes(b"junk")
+    config = tiny_config(tmp_path / "run", steps=2)
+    config.data.dataset, config.data.root, config.data.batch_size = "nuscenes", str(tree.root), 4
+    with pytest.raises(FrameError, match=f"{tree.images[1]['CAM_BACK']}: image file must be readable"):
+        pretrain(config)
+    config.run, config.data.on_error = str(tmp_path / "skipping"), "skip"
+    # Two of a batch's four slots are the broken frame's.
+    assert [row["skipped_frames"] for row in read_log(pretrain(config))] == ["2", "4"]
 
 
 # Parts
@@ -453,11 +485,15 @@ def test_csv_log_killed_within_the_header(tmp_path: Path) -> None:
     assert path.read_text() == "step,loss\n1,0.5\n"
 
 
-def test_config_classes_document_every_field() -> None:
-    import inspect
-
-    for config_class in (TrainConfig, PretrainConfig):
-        source = inspect.getsource(config_class)
-        for item in dataclasses.fields(config_class):
-            if not dataclasses.is_dataclass(item.type):
-                assert f"{item.name}: " in source and '"""' in source.split(f"    {item.name}: ")[1].split("\n")[1]
+@pytest.mark.parametrize(
+    "config_class",
+    [
+        PretrainConfig, DataConfig, StreetConfig, PillarEncoderConfig, FieldConfig, RendererConfig, LossConfig,
+        TrainConfig,
+    ],
+)  # fmt: skip
+def test_config_classes_document_every_field(config_class: type[Any]) -> None:
+    """As jsonargparse reads it for --help: from the docstring, or the string below a field."""
+    documented = docstring_parser.parse_from_object(config_class).params
+    described = {item.arg_name for item in documented if item.description}
+    assert described == {item.name for item in dataclasses.fields(config_class)}

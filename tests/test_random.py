@@ -6,9 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
-from pred.random import numpy_generator, seed_of, torch_generator
+from pred.random import numpy_generator, seed_of
 
 
 def test_seed_is_pinned() -> None:
@@ -45,6 +44,3 @@ def test_generators_depend_on_their_key_only() -> None:
     numpy_generator(3, 6, "token", "mask").random(1000)
     assert np.array_equal(numpy_generator(3, 5, "token", "mask").random(8), first)
     assert not np.array_equal(numpy_generator(3, 5, "token", "rays").random(8), first)
-    drawn = torch.rand(8, generator=torch_generator(3, "weights"))
-    assert torch.equal(torch.rand(8, generator=torch_generator(3, "weights")), drawn)
-    assert not torch.equal(torch.rand(8, generator=torch_generator(4, "weights")), drawn)

@@ -20,7 +20,9 @@ from pred.data.frame import NUM_CLASSES, Frame, FrameError, FrameSource
 from pred.data.masking import visible_points
 from pred.data.nuscenes import NuScenesFrames
 from pred.data.rays import (
+    NEAR_M,
     DepthCandidates,
+    DepthView,
     FrameCandidates,
     SemanticCandidates,
     draw_class_balanced,
@@ -62,7 +64,7 @@ class DataConfig:
     """LiDAR sweeps per frame, the keyframe's own included; fewer where a scene starts."""
     labels: str | None = "auto"
     """Folder under `root` with <CAMERA>/<image stem>.png|.npy|.npz; auto: the only folder under
-    pseudo/; none (or no such folder): LiDAR-only."""
+    pseudo/; none (or no such folder): LiDAR-only. The street knows auto (exact labels) and none."""
     batch_size: int = 4
     """Frames per batch and process."""
     mask_ratio: float = 0.95
@@ -75,7 +77,7 @@ class DataConfig:
     """Semantic rays drawn for every camera image."""
     depth_rays: int = 3072
     """Depth rays drawn for every frame."""
-    depth_view: Literal["lidar", "image"] = "lidar"
+    depth_view: DepthView = "lidar"
     """Depth rays start at the LiDAR (target: range) or at the cameras (target: z-depth)."""
     class_counts: Literal["batch", "dataset"] = "batch"
     """Where class frequencies for balanced sampling are counted; dataset reads every frame once."""
@@ -89,6 +91,8 @@ class DataConfig:
     def __post_init__(self) -> None:
         if self.dataset == "nuscenes" and self.root == "":
             raise ValueError("data.root must name a folder, got an empty string")
+        if self.dataset == "street" and self.labels not in ("auto", "none", None):
+            raise ValueError(f"data.labels must be auto or none for the street, got {self.labels!r}")
         for name in ("sweeps", "batch_size", "semantic_rays_per_camera", "depth_rays"):
             if getattr(self, name) < 1:
                 raise ValueError(f"data.{name} must be at least 1, got {getattr(self, name)}")
@@ -157,7 +161,7 @@ class Batch:
         point_offsets: [B + 1] int64, frame b owns points[point_offsets[b]:point_offsets[b + 1]].
         depth: depth rays.
         semantic: semantic rays; None without pseudo labels.
-        skipped: token -> error text of the broken frames that were replaced in this batch.
+        skipped: (token, error text) each time that a broken frame was replaced in this batch.
     """
 
     step: int
@@ -166,7 +170,7 @@ class Batch:
     point_offsets: Tensor
     depth: DepthRays
     semantic: SemanticRays | None
-    skipped: dict[str, str]
+    skipped: list[tuple[str, str]]
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
         """The batch on another device."""
@@ -191,6 +195,7 @@ class TrainingBatches(Dataset[Batch]):
         total_steps: number of steps of the run.
         rank, world_size: this process among those that train together; they share out the slots.
         source: frames; None builds what ``config`` names.
+        near_m: rays are rendered from this distance on, metres; nearer returns are no targets.
     """
 
     def __init__(
@@ -202,6 +207,7 @@ class TrainingBatches(Dataset[Batch]):
         rank: int = 0,
         world_size: int = 1,
         source: FrameSource | None = None,
+        near_m: float = NEAR_M,
     ) -> None:
         self.config = config
         self.point_range = point_range
@@ -209,13 +215,14 @@ class TrainingBatches(Dataset[Batch]):
         self.total_steps = total_steps
         self.rank = rank
         self.world_size = world_size
+        self.near_m = near_m
         self.source = build_source(config) if source is None else source
         if self.num_frames == 0:
             raise ValueError("source must hold at least one frame, got none")
         self._cache: dict[int, FrameCandidates] = {}
         self._class_counts: NDArray[np.int64] | None = None
         if config.class_counts == "dataset":
-            self._class_counts = count_classes(self.source, config, point_range, rank == 0)
+            self._class_counts = count_classes(self.source, config, point_range, near_m, rank == 0)
 
     @property
     def num_frames(self) -> int:
@@ -230,7 +237,7 @@ class TrainingBatches(Dataset[Batch]):
             raise IndexError(f"step must be in [0, {self.total_steps}), got {step}")
         first = (step * self.world_size + self.rank) * self.config.batch_size
         slots = range(first, first + self.config.batch_size)
-        skipped: dict[str, str] = {}
+        skipped: list[tuple[str, str]] = []
         frames = [self._good_frame(slot, skipped) for slot in slots]
         class_counts = self._class_counts
         if class_counts is None:
@@ -247,7 +254,7 @@ class TrainingBatches(Dataset[Batch]):
             skipped=skipped,
         )
 
-    def _good_frame(self, slot: int, skipped: dict[str, str]) -> FrameCandidates:
+    def _good_frame(self, slot: int, skipped: list[tuple[str, str]]) -> FrameCandidates:
         """The frame of a slot, or the next one of the epoch that can be read (``on_error``)."""
         epoch, position = divmod(slot, self.num_frames)
         order = numpy_generator(self.seed, epoch, "frame order").permutation(self.num_frames)
@@ -258,7 +265,7 @@ class TrainingBatches(Dataset[Batch]):
             except FrameError as error:
                 if self.config.on_error == "raise":
                     raise
-                skipped[self.source.token(index)] = str(error)
+                skipped.append((self.source.token(index), str(error)))
                 last_error = error
         raise FrameError(
             last_error.path,
@@ -268,7 +275,7 @@ class TrainingBatches(Dataset[Batch]):
     def _candidates(self, index: int) -> FrameCandidates:
         if index in self._cache:
             return self._cache[index]
-        candidates = _candidates(self.source.load(index), self.config, self.point_range)
+        candidates = _candidates(self.source.load(index), self.config, self.point_range, self.near_m)
         if self.num_frames <= CACHED_FRAMES:
             self._cache[index] = candidates
         return candidates
@@ -297,7 +304,7 @@ def build_source(config: DataConfig) -> FrameSource:
         # Simulation needs a ray caster that readers of real data do not.
         from pred.data.world import StreetFrames
 
-        return StreetFrames(config.street)
+        return StreetFrames(config.street, labels=config.labels not in ("none", None))
     if config.root is None:
         raise ValueError("data.root must name the folder of the data set, got None")
     return NuScenesFrames(
@@ -311,7 +318,11 @@ def build_source(config: DataConfig) -> FrameSource:
 
 
 def count_classes(
-    source: FrameSource, config: DataConfig, point_range: PointRange, show_progress: bool = True
+    source: FrameSource,
+    config: DataConfig,
+    point_range: PointRange,
+    near_m: float = NEAR_M,
+    show_progress: bool = True,
 ) -> NDArray[np.int64]:
     """[19] semantic candidates of each class in the whole data set; reads every frame once.
 
@@ -319,7 +330,7 @@ def count_classes(
         FrameError: a frame is broken and ``config.on_error`` is "raise".
     """
     loader: DataLoader[NDArray[np.int64]] = DataLoader(
-        _ClassCounts(source, config, point_range),
+        _ClassCounts(source, config, point_range, near_m),
         batch_size=None,
         num_workers=config.workers,
         multiprocessing_context=WORKER_START if config.workers else None,
@@ -331,7 +342,9 @@ def count_classes(
     return counts
 
 
-def evaluation_batch(frame: Frame, config: DataConfig, point_range: PointRange, seed: int) -> Batch:
+def evaluation_batch(
+    frame: Frame, config: DataConfig, point_range: PointRange, seed: int, near_m: float = NEAR_M
+) -> Batch:
     """Batch of one frame whose rays aim at all held-out returns, each once.
 
     The visible points are a fixed mask of ``seed`` and the frame. Depth rays are those of the LiDAR
@@ -340,7 +353,7 @@ def evaluation_batch(frame: Frame, config: DataConfig, point_range: PointRange, 
     Raises:
         FrameError: a pseudo label cannot be used.
     """
-    candidates = _candidates(frame, replace(config, depth_view="lidar"), point_range, held_out=True)
+    candidates = _candidates(frame, replace(config, depth_view="lidar"), point_range, near_m, held_out=True)
     rng = numpy_generator(seed, frame.token, "evaluation mask")
     visible = visible_points(len(candidates.points), config.mask_ratio, rng)
     semantic = join_cameras(candidates.semantic)
@@ -359,17 +372,18 @@ def evaluation_batch(frame: Frame, config: DataConfig, point_range: PointRange, 
         draws=[draw],
         num_depth_rays=max(1, len(draw.depth_jitter)),
         num_semantic_rays=max(1, len(draw.semantic_jitter)) if has_labels else 0,
-        skipped={},
+        skipped=[],
     )
 
 
 class _ClassCounts(Dataset[NDArray[np.int64]]):
     """Class counts of every frame; zeros for a broken frame that is to be skipped."""
 
-    def __init__(self, source: FrameSource, config: DataConfig, point_range: PointRange) -> None:
+    def __init__(self, source: FrameSource, config: DataConfig, point_range: PointRange, near_m: float) -> None:
         self.source = source
         self.config = config
         self.point_range = point_range
+        self.near_m = near_m
 
     def __len__(self) -> int:
         return len(self.source)
@@ -377,7 +391,7 @@ class _ClassCounts(Dataset[NDArray[np.int64]]):
     def __getitem__(self, index: int) -> NDArray[np.int64]:
         try:
             frame = self.source.load(index)
-            return _candidates(frame, self.config, self.point_range).class_counts()
+            return _candidates(frame, self.config, self.point_range, self.near_m).class_counts()
         except FrameError:
             if self.config.on_error == "raise":
                 raise
@@ -395,7 +409,9 @@ class _Draw(NamedTuple):
     semantic_jitter: NDArray[np.float32]
 
 
-def _candidates(frame: Frame, config: DataConfig, point_range: PointRange, held_out: bool = False) -> FrameCandidates:
+def _candidates(
+    frame: Frame, config: DataConfig, point_range: PointRange, near_m: float, held_out: bool = False
+) -> FrameCandidates:
     return frame_candidates(
         frame,
         point_range,
@@ -403,6 +419,7 @@ def _candidates(frame: Frame, config: DataConfig, point_range: PointRange, held_
         config.holdout_fraction,
         depth_view=config.depth_view,
         held_out=held_out,
+        near_m=near_m,
     )
 
 
@@ -443,7 +460,7 @@ def _collate(
     draws: list[_Draw],
     num_depth_rays: int,
     num_semantic_rays: int,
-    skipped: dict[str, str],
+    skipped: list[tuple[str, str]],
 ) -> Batch:
     """Stack frames; missing rays become placeholders: straight up, depth 1, not valid."""
     depth = [draw.depth for draw in draws]

@@ -159,6 +159,8 @@ class Frame:
         source: file or description, for error texts.
         semantics: [N] exact classes of simulated points (train ids, 255 = none), or None.
         boxes: annotations, or None.
+        earlier_keyframes: for each sweep that is the keyframe of an earlier frame, that frame's
+            token and the sweep's rows in ``points``. What that frame holds out is no input here either.
     """
 
     token: str
@@ -170,6 +172,7 @@ class Frame:
     source: str = ""
     semantics: NDArray[np.integer[Any]] | None = None
     boxes: Boxes | None = None
+    earlier_keyframes: dict[str, slice] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         name = self.source or self.token
@@ -232,17 +235,33 @@ def outside_ego_box(points: NDArray[Any], ego_box: tuple[float, ...]) -> NDArray
     return ~((x > x_min) & (x < x_max) & (y > y_min) & (y < y_max))
 
 
-def open_image(path: Path) -> Image.Image:
-    """Open and fully decode an image file; every way in which that fails becomes a `FrameError`."""
+def open_image(path: Path, decode: bool = True) -> Image.Image:
+    """Open an image file and decode it, or read its header only; every way in which that fails
+    becomes a `FrameError`."""
     try:
         image = Image.open(path)
-        image.load()
+        if decode:
+            image.load()
     except FileNotFoundError:
         raise FrameError(path, "image file must exist, got no such file") from None
     # Pillow reports damage as OSError, SyntaxError, ValueError, EOFError, struct.error, ...
     except Exception as error:
         raise FrameError(path, f"image file must be readable, got {type(error).__name__}: {error}") from None
     return image
+
+
+def check_image_header(path: Path, width: int, height: int) -> None:
+    """Check size and mode of an image file without decoding it.
+
+    Raises:
+        FrameError: it is missing, no image, or not RGB of ``width`` x ``height`` pixels.
+    """
+    with open_image(path, decode=False) as image:
+        size, mode = image.size, image.mode
+    if (size, mode) != ((width, height), "RGB"):
+        raise FrameError(
+            path, f"image must be RGB of {width} x {height} pixels, got {mode} of {size[0]} x {size[1]} pixels"
+        )
 
 
 def _read_rgb(path: Path) -> NDArray[np.uint8]:

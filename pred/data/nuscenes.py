@@ -24,6 +24,7 @@ from pred.data.frame import (
     Camera,
     Frame,
     FrameError,
+    check_image_header,
     invert_rigid,
 )
 from pred.data.labels import PseudoLabel, find_label_file
@@ -53,6 +54,7 @@ class _SensorData:
     calibration: NDArray[np.int64]  # [n]
     previous: NDArray[np.int64]  # [n] row of the sweep before, -1 at the start of a scene
     size: NDArray[np.int64]  # [n, 2] image width and height
+    keyframe_of: NDArray[np.int64]  # [n] sample whose keyframe the row is, -1 for sweeps in between
     ego_pose: NDArray[np.float64]  # [n, 7] translation, quaternion w x y z, ego to world
 
 
@@ -116,10 +118,11 @@ class NuScenesFrames:
         return self._tokens[index]
 
     def load(self, index: int) -> Frame:
-        """Read the sweeps of keyframe ``index``; images and labels are only checked to exist.
+        """Read the sweeps of keyframe ``index``. With labels, images are checked by their headers
+        and labels to exist; without, images may be missing.
 
         Raises:
-            FrameError: a file is missing, truncated or holds NaN or Inf.
+            FrameError: a file is missing, truncated, of the wrong type or size, or holds NaN or Inf.
         """
         token = self._tokens[index]
         keyframe = int(self._lidar_rows[index])
@@ -129,7 +132,7 @@ class NuScenesFrames:
                 f"sample {token} must have a {LIDAR_CHANNEL} keyframe, got none",
             )
         T_world_from_lidar = self._sensor_pose(keyframe)
-        points, point_index, is_keyframe = self._accumulate_sweeps(keyframe, T_world_from_lidar)
+        points, point_index, is_keyframe, earlier_keyframes = self._accumulate_sweeps(keyframe, T_world_from_lidar)
         camera_rows = [int(row) for row in self._camera_rows[index] if row >= 0]
         return Frame(
             token=token,
@@ -140,6 +143,7 @@ class NuScenesFrames:
             T_world_from_lidar=T_world_from_lidar,
             source=str(self.root / self._data.filename[keyframe]),
             boxes=self._boxes(index, T_world_from_lidar),
+            earlier_keyframes=earlier_keyframes,
         )
 
     # Frames
@@ -151,8 +155,11 @@ class NuScenesFrames:
 
     def _accumulate_sweeps(
         self, keyframe: int, T_world_from_lidar: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.bool_]]:
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.bool_], dict[str, slice]]:
+        """`Frame.points`, `Frame.point_index`, `Frame.is_keyframe` and `Frame.earlier_keyframes`."""
         points, point_index, is_keyframe = [], [], []
+        earlier_keyframes: dict[str, slice] = {}
+        num_points = 0
         row = keyframe
         for _ in range(self.sweeps):
             sweep = _read_sweep(self.root / self._data.filename[row])
@@ -163,10 +170,14 @@ class NuScenesFrames:
             points.append(sweep)
             point_index.append(kept)
             is_keyframe.append(np.full(len(kept), row == keyframe))
+            sample = int(self._data.keyframe_of[row])
+            if sample >= 0 and row != keyframe:
+                earlier_keyframes[self._tokens[sample]] = slice(num_points, num_points + len(kept))
+            num_points += len(kept)
             row = int(self._data.previous[row])
             if row < 0:
                 break
-        return np.concatenate(points), np.concatenate(point_index), np.concatenate(is_keyframe)
+        return np.concatenate(points), np.concatenate(point_index), np.concatenate(is_keyframe), earlier_keyframes
 
     def _camera(self, row: int, T_world_from_lidar: NDArray[np.float64]) -> Camera:
         calibration = self._calibrations[self._data.calibration[row]]
@@ -174,8 +185,7 @@ class NuScenesFrames:
         image = self.root / self._data.filename[row]
         labels = None
         if self.labels is not None:
-            if not image.is_file():
-                raise FrameError(image, "image file must exist, got no such file")
+            check_image_header(image, width, height)
             label_file = find_label_file(self.labels / calibration.channel, image.stem)
             labels = PseudoLabel(label_file, width, height)
         return Camera(
@@ -185,7 +195,7 @@ class NuScenesFrames:
             T_camera_from_lidar=invert_rigid(self._sensor_pose(row)) @ T_world_from_lidar,
             width=width,
             height=height,
-            image=image,
+            image=image if image.is_file() else None,
             labels=labels,
         )
 
@@ -246,7 +256,7 @@ class NuScenesFrames:
         previous_tokens: list[str] = []
         pose_tokens: list[str] = []
         filenames: list[str] = []
-        numbers = array("q")  # time, calibration, width, height
+        numbers = array("q")  # time, calibration, width, height, keyframe_of
         keyframes: list[tuple[int, str, int]] = []  # sample row, channel, data row
 
         def read_row(row: Row) -> None:
@@ -266,17 +276,18 @@ class NuScenesFrames:
             width, height = (row["width"], row["height"]) if is_image else (0, 0)
             if is_image and not (width > 0 and height > 0):
                 raise ValueError(f"width and height must be positive, got {width} x {height}")
-            numbers.extend((row["timestamp"], calibration, width, height))
+            numbers.extend((row["timestamp"], calibration, width, height, sample if is_keyframe else -1))
 
         self._table("sample_data", read_row)
-        columns = np.frombuffer(numbers, dtype=np.int64).reshape(-1, 4)
+        columns = np.frombuffer(numbers, dtype=np.int64).reshape(-1, 5)
         self._data = _SensorData(
             filename=filenames,
             time_us=columns[:, 0],
             calibration=columns[:, 1],
             # A sweep that is not in the table (a subset of a scene) ends the walk like a start.
             previous=np.array([data_rows.get(token, -1) for token in previous_tokens], np.int64),
-            size=columns[:, 2:],
+            size=columns[:, 2:4],
+            keyframe_of=columns[:, 4],
             ego_pose=self._read_ego_poses(pose_tokens),
         )
         is_camera = [c.modality == "camera" for c in self._calibrations]

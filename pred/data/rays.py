@@ -5,7 +5,7 @@
 Two populations that are never mixed: depth rays towards LiDAR returns, and semantic rays from
 cameras through the pixels that LiDAR returns project to (PRED section 3.2). Both use the keyframe's
 own returns inside the range box and outside the ego box. The held-out returns among them are for
-evaluation only; the encoder never sees those either.
+evaluation only; the encoder never sees those either, not even in a later frame's sweeps.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pred.data.frame import NUM_CLASSES, Camera, Frame, inside_range, outside_eg
 from pred.data.masking import is_held_out
 
 NEAR_M = 1.0
-"""Rays are rendered from this distance on, so nearer returns are no targets."""
+"""Default distance, metres, from which rays are rendered: nearer returns are no targets."""
 
 DepthView = Literal["lidar", "image"]
 
@@ -87,6 +87,7 @@ def frame_candidates(
     holdout_fraction: float,
     depth_view: DepthView = "lidar",
     held_out: bool = False,
+    near_m: float = NEAR_M,
 ) -> FrameCandidates:
     """Split a frame into what the encoder may see and what rays may aim at.
 
@@ -97,31 +98,35 @@ def frame_candidates(
         holdout_fraction: share of the keyframe returns kept for evaluation.
         depth_view: where depth rays start.
         held_out: False: rays for training; True: rays towards the held-out returns.
+        near_m: rays are rendered from this distance on, so nearer returns are no targets, metres.
 
     Raises:
         FrameError: a pseudo label cannot be used.
     """
     held = frame.is_keyframe & is_held_out(frame.point_index, frame.token, holdout_fraction)
+    hidden = held.copy()
+    for token, rows in frame.earlier_keyframes.items():
+        hidden[rows] = is_held_out(frame.point_index[rows], token, holdout_fraction)
     # Sweep points may lie where the own car is now: it has moved since.
     own_car = frame.is_keyframe & ~outside_ego_box(frame.points, ego_box)
     inside = inside_range(frame.points, point_range) & ~own_car
     aimed_at = inside & frame.is_keyframe & (held if held_out else ~held)
     returns = frame.points[aimed_at, :3].astype(np.float64)
     if depth_view == "lidar":
-        depth = _lidar_view(returns)
+        depth = _lidar_view(returns, near_m)
     else:
-        depth = _image_view(returns, frame.cameras)
+        depth = _image_view(returns, frame.cameras, near_m)
     return FrameCandidates(
         token=frame.token,
-        points=frame.points[inside & ~held],
+        points=frame.points[inside & ~hidden],
         depth=depth,
-        semantic=[_semantic(returns, camera) for camera in frame.cameras if camera.labels is not None],
+        semantic=[_semantic(returns, camera, near_m) for camera in frame.cameras if camera.labels is not None],
     )
 
 
-def _lidar_view(returns: NDArray[np.float64]) -> DepthCandidates:
+def _lidar_view(returns: NDArray[np.float64], near_m: float) -> DepthCandidates:
     directions, range_m = _unit(returns, np.zeros(3))
-    far = range_m > NEAR_M
+    far = range_m > near_m
     num_rays = int(np.count_nonzero(far))
     return DepthCandidates(
         origins=np.zeros((num_rays, 3), dtype=np.float32),
@@ -131,7 +136,7 @@ def _lidar_view(returns: NDArray[np.float64]) -> DepthCandidates:
     )
 
 
-def _image_view(returns: NDArray[np.float64], cameras: list[Camera]) -> DepthCandidates:
+def _image_view(returns: NDArray[np.float64], cameras: list[Camera], near_m: float) -> DepthCandidates:
     """A return that two cameras see gives two rays."""
     parts = [np.zeros((0, 8))]
     for camera in cameras:
@@ -140,18 +145,18 @@ def _image_view(returns: NDArray[np.float64], cameras: list[Camera]) -> DepthCan
         directions, distance_m = _unit(returns, centre)
         depth_factor = directions @ camera.T_camera_from_lidar[2, :3]
         origins = np.broadcast_to(centre, directions.shape)
-        seen = camera.in_image(uv, z_depth_m) & (distance_m > NEAR_M)
+        seen = camera.in_image(uv, z_depth_m) & (distance_m > near_m)
         parts.append(np.column_stack([origins, directions, z_depth_m, depth_factor])[seen])
     rays = np.concatenate(parts).astype(np.float32)
     return DepthCandidates(rays[:, :3], rays[:, 3:6], rays[:, 6], rays[:, 7])
 
 
-def _semantic(returns: NDArray[np.float64], camera: Camera) -> SemanticCandidates:
+def _semantic(returns: NDArray[np.float64], camera: Camera, near_m: float) -> SemanticCandidates:
     assert camera.labels is not None
     centre = camera.T_lidar_from_camera[:3, 3]
     uv, z_depth_m = camera.project(returns)
     directions, distance_m = _unit(returns, centre)
-    seen = np.flatnonzero(camera.in_image(uv, z_depth_m) & (distance_m > NEAR_M))
+    seen = np.flatnonzero(camera.in_image(uv, z_depth_m) & (distance_m > near_m))
     labels = camera.labels.lookup(uv[seen])
     labelled = labels.class_id >= 0
     num_rays = int(np.count_nonzero(labelled))

@@ -11,8 +11,11 @@ from pred.data.frame import outside_ego_box, transform_points
 
 try:
     from pred import _host
-except ImportError:  # built for another Python version, or not at all
+
+    HOST_ERROR: str | None = None  # why `_host` is not used: `pred doctor` prints it
+except ImportError as error:  # built for another Python version, or not at all
     _host = None  # type: ignore[assignment]
+    HOST_ERROR = str(error)
 
 
 def place_sweep(

@@ -26,9 +26,12 @@ from pred.data.batch import (
     evaluation_batch,
     make_loader,
 )
-from pred.data.frame import Camera, Frame, FrameError
+from pred.data.frame import Camera, Frame, FrameError, inside_range, invert_rigid, transform_points
 from pred.data.labels import PseudoLabel
 from pred.data.masking import is_held_out
+from pred.data.nuscenes import NuScenesFrames
+from pred.data.rays import NEAR_M, frame_candidates
+from pred.models.renderer import RendererConfig
 from tests.data.tiny_tree import NUM_LANDMARKS, Tree, write_tree
 
 POINT_RANGE = (-25.0, -25.0, -5.0, 25.0, 25.0, 3.0)
@@ -125,7 +128,7 @@ def small_batches(source: MemoryFrames, steps: int = 3, **changes: Any) -> Train
 
 def test_shapes(tree: Tree) -> None:
     batch = TrainingBatches(tree_config(tree), POINT_RANGE, seed=0, total_steps=3)[1]
-    assert batch.step == 1 and sorted(batch.tokens) == sorted(tree.tokens) and batch.skipped == {}
+    assert batch.step == 1 and sorted(batch.tokens) == sorted(tree.tokens) and batch.skipped == []
     assert batch.points.shape[1] == 5 and batch.points.dtype == torch.float32
     assert batch.point_offsets.dtype == torch.int64
     assert batch.point_offsets.shape == (3,)
@@ -147,11 +150,48 @@ def test_visible_points_are_a_share_of_the_candidates(tree: Tree) -> None:
         frame = batches.source.load(tree.tokens.index(token))
         inside = (np.abs(frame.points[:, :2]) < 25).all(axis=1) & (frame.points[:, 2] < 3) & (frame.points[:, 2] > -5)
         held = is_held_out(frame.point_index, token, 0.1) & frame.is_keyframe
+        for earlier, rows in frame.earlier_keyframes.items():
+            held[rows] = is_held_out(frame.point_index[rows], earlier, 0.1)
         candidates = {point.tobytes() for point in frame.points[inside & ~held]}
         visible = batch.points[batch.point_offsets[b] : batch.point_offsets[b + 1]].numpy()
         assert len(visible) == round(0.2 * len(candidates))
         assert {point.tobytes() for point in visible} <= candidates
         assert len(np.unique(visible[:, 4])) == (2 if token == tree.tokens[0] else 4)
+
+
+def test_held_out_returns_are_no_input_of_the_next_keyframe(tree: Tree) -> None:
+    frames = NuScenesFrames(tree.root)
+    first, second = frames.load(0), frames.load(1)
+    held = first.is_keyframe & is_held_out(first.point_index, first.token, 0.1)
+    seen_again = transform_points(
+        invert_rigid(second.T_world_from_lidar) @ first.T_world_from_lidar, first.points[:, :3]
+    )
+    age_s = np.full(len(first.points), 0.1)  # two sweeps later
+    candidates = frame_candidates(second, POINT_RANGE, (0, 0, 0, 0), 0.1).points
+    found = candidates[:, [0, 1, 2, 4]]
+
+    def distance_to_input(chosen: np.ndarray) -> np.ndarray:
+        wanted = np.column_stack([seen_again, age_s])[chosen & inside_range(seen_again, POINT_RANGE)]
+        assert len(wanted) > 10
+        distance: np.ndarray = np.abs(wanted[:, None] - found[None]).max(axis=2).min(axis=1)
+        return distance
+
+    assert distance_to_input(held).min() > 1e-2
+    # The keyframe's other returns are there.
+    assert distance_to_input(first.is_keyframe & ~held).max() < 1e-4
+
+
+def test_near_returns_are_no_targets(tree: Tree) -> None:
+    config = tree_config(tree, class_counts="dataset")
+    near_m = 15.0
+    batches = TrainingBatches(config, POINT_RANGE, seed=0, total_steps=1, near_m=near_m)
+    evaluation = evaluation_batch(batches.source.load(1), config, POINT_RANGE, seed=0, near_m=near_m)
+    for batch in (batches[0], evaluation):
+        assert batch.depth.valid.all() and batch.depth.depth_m.min() > near_m
+    assert batches._class_counts is not None
+    everything = count_classes(batches.source, config, POINT_RANGE, show_progress=False)
+    assert 0 < batches._class_counts.sum() < everything.sum()
+    assert NEAR_M == RendererConfig().near_m
 
 
 def test_rays_of_a_step_aim_at_returns_that_are_not_held_out(tree: Tree) -> None:
@@ -333,7 +373,13 @@ def remove_image(tree: Tree) -> Path:
     return path
 
 
-@pytest.mark.parametrize("damage", [break_points, break_label, break_probabilities, remove_image])
+def break_image(tree: Tree) -> Path:
+    path = tree.images[1]["CAM_BACK"]
+    path.write_bytes(b"junk" * 100)
+    return path
+
+
+@pytest.mark.parametrize("damage", [break_points, break_label, break_probabilities, remove_image, break_image])
 @pytest.mark.parametrize("workers", [0, 2])
 def test_skip_takes_the_next_frame_and_counts(tree: Tree, damage: Callable[[Tree], Path], workers: int) -> None:
     path = damage(tree)
@@ -341,9 +387,16 @@ def test_skip_takes_the_next_frame_and_counts(tree: Tree, damage: Callable[[Tree
     batches = list(make_loader(TrainingBatches(config, POINT_RANGE, 0, 3), workers=workers))
     for batch in batches:
         assert batch.tokens == [tree.tokens[0]] * 2
-        assert list(batch.skipped) == [tree.tokens[1]]
-        assert batch.skipped[tree.tokens[1]].startswith(f"{path}: ")
+        [(token, text)] = batch.skipped
+        assert token == tree.tokens[1] and text.startswith(f"{path}: ")
         assert batch.depth.valid.all()
+
+
+def test_every_replacement_in_a_batch_counts(tree: Tree) -> None:
+    break_points(tree)
+    batch = TrainingBatches(tree_config(tree, on_error="skip", batch_size=6), POINT_RANGE, 0, 1)[0]
+    assert batch.tokens == [tree.tokens[0]] * 6
+    assert [token for token, _ in batch.skipped] == [tree.tokens[1]] * 3
 
 
 def test_skip_with_no_frame_left(tree: Tree) -> None:
@@ -373,7 +426,7 @@ def test_replacement_follows_the_schedule() -> None:
             continue
         epoch = order[step // 5 * 5 :][:5]
         assert batch.tokens == [epoch[(step + 1) % 5]]
-        assert batch.skipped == {"token-2": "some/file: is broken"}
+        assert batch.skipped == [("token-2", "some/file: is broken")]
 
 
 # Frames with little or nothing in them
@@ -445,6 +498,9 @@ def test_evaluation_batch_uses_every_held_out_return_once(tree: Tree) -> None:
     frame = build_source(config).load(1)
     batch = evaluation_batch(frame, config, POINT_RANGE, seed=0)
     held = is_held_out(frame.point_index, frame.token, 0.3) & frame.is_keyframe
+    rows = frame.earlier_keyframes[tree.tokens[0]]
+    hidden = held.copy()
+    hidden[rows] = is_held_out(frame.point_index[rows], tree.tokens[0], 0.3)
     xyz = frame.points[:, :3]
     inside = (np.abs(xyz[:, :2]) < 25).all(axis=1) & (xyz[:, 2] < 3) & (xyz[:, 2] > -5)
     expected = xyz[held & inside]
@@ -454,8 +510,8 @@ def test_evaluation_batch_uses_every_held_out_return_once(tree: Tree) -> None:
     np.testing.assert_allclose(aimed_at, expected, atol=1e-4)
     assert batch.depth.valid.all() and (batch.depth.depth_factor == 1).all()
     visible = {point.tobytes() for point in batch.points.numpy()}
-    assert not visible & {point.tobytes() for point in frame.points[held]}
-    assert len(visible) == round(0.2 * (inside & ~held).sum())
+    assert not visible & {point.tobytes() for point in frame.points[hidden]}
+    assert len(visible) == round(0.2 * (inside & ~hidden).sum())
     assert batch.semantic is not None and batch.semantic.valid.all()
     num_seen = 0
     for camera in frame.cameras:
@@ -493,6 +549,10 @@ def test_evaluation_batch_with_nothing_held_out() -> None:
         ({"holdout_fraction": -0.1}, r"data\.holdout_fraction must be in \[0, 1\), got -0\.1"),
         ({"workers": -1}, r"data\.workers must be at least 0, got -1"),
         ({"ego_box": (1.0, 0.0, -1.0, 0.0)}, r"data\.ego_box must be \(x_min"),
+        (
+            {"dataset": "street", "labels": "pseudo/x"},
+            r"data\.labels must be auto or none for the street, got 'pseudo/x'",
+        ),
     ],
 )
 def test_wrong_settings(changes: dict[str, Any], text: str) -> None:

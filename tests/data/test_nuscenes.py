@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pred.data.frame import FrameError
 from pred.data.nuscenes import NuScenesFrames
@@ -43,6 +44,9 @@ def test_sweeps_accumulate_in_the_keyframe(tree: Tree) -> None:
         assert frame.is_keyframe[:NUM_LANDMARKS].all() and not frame.is_keyframe[NUM_LANDMARKS:].any()
         np.testing.assert_allclose(frame.T_world_from_lidar, tree.T_world_from_lidar[index], atol=1e-9)
         assert frame.source == str(tree.keyframe_files[index])
+        # Frame 1: own, in between, keyframe of frame 0, in between.
+        earlier = {tree.tokens[0]: slice(2 * NUM_LANDMARKS, 3 * NUM_LANDMARKS)} if index == 1 else {}
+        assert frame.earlier_keyframes == earlier
 
 
 def test_own_car_is_removed_and_point_index_kept(tree: Tree) -> None:
@@ -101,6 +105,7 @@ def test_without_labels_images_may_be_missing(tree: Tree, labels: str | None) ->
     tree.images[0]["CAM_FRONT"].unlink()
     frame = NuScenesFrames(tree.root, labels=labels).load(0)
     assert [camera.labels for camera in frame.cameras] == [None, None]
+    assert [camera.image for camera in frame.cameras] == [tree.images[0]["CAM_BACK"], None]
 
 
 def test_no_label_folder_means_no_labels(tree: Tree) -> None:
@@ -200,6 +205,22 @@ def test_missing_image_and_label(tree: Tree) -> None:
     assert broken_text(tree).startswith(f"{label}: label file must exist")
     tree.images[1]["CAM_FRONT"].unlink()
     assert broken_text(tree) == f"{tree.images[1]['CAM_FRONT']}: image file must exist, got no such file"
+
+
+def test_damaged_image_and_image_of_another_size_or_mode(tree: Tree) -> None:
+    path = tree.images[1]["CAM_FRONT"]
+    whole = path.read_bytes()
+    path.write_bytes(b"junk" * 100)
+    assert broken_text(tree).startswith(f"{path}: image file must be readable, got UnidentifiedImageError")
+    rule = "image must be RGB of 64 x 36 pixels, got"
+    for mode, size in (("RGB", (36, 64)), ("L", (64, 36))):
+        Image.new(mode, size).save(path)
+        assert broken_text(tree) == f"{path}: {rule} {mode} of {size[0]} x {size[1]} pixels"
+    # Only the header is read.
+    path.write_bytes(whole[:-100])
+    camera = NuScenesFrames(tree.root).load(1).cameras[1]
+    with pytest.raises(FrameError, match=rf"{path}: image file must be readable, got OSError"):
+        camera.load_image()
 
 
 @pytest.mark.parametrize("table", ["scene", "sample", "sample_data", "ego_pose", "sample_annotation", "category"])

@@ -5,12 +5,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from pred.data.frame import Camera, Frame
 from pred.data.labels import PseudoLabel
 from pred.data.masking import is_held_out
-from pred.data.rays import draw_class_balanced, draw_uniform, frame_candidates
+from pred.data.rays import DepthView, draw_class_balanced, draw_uniform, frame_candidates
 from pred.random import numpy_generator
 
 POINT_RANGE = (-20.0, -20.0, -3.0, 20.0, 20.0, 3.0)
@@ -50,6 +51,16 @@ def test_returns_within_one_metre_are_input_but_no_target() -> None:
     found = frame_candidates(make_frame([[0.6, 0.6, 0.0], [0.8, 0.8, 0.0]]), POINT_RANGE, (0, 0, 0, 0), 0.0)
     np.testing.assert_allclose(found.depth.depth_m, [1.28**0.5])
     assert len(found.points) == 2
+
+
+@pytest.mark.parametrize("view", ["lidar", "image"])
+def test_targets_are_farther_than_near_m(view: DepthView) -> None:
+    frame = make_frame([[0.0, 3.5, 0.0], [0.0, 4.5, 0.0]], np.zeros((25, 50), dtype=np.uint8))
+    # The camera sits 1 m ahead of the LiDAR.
+    for near_m, num_lidar, num_camera in ((2.0, 2, 2), (3.0, 2, 1), (4.0, 1, 0)):
+        found = frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.0, depth_view=view, near_m=near_m)
+        assert len(found.depth.depth_m) == (num_lidar if view == "lidar" else num_camera)
+        assert len(found.semantic[0].class_id) == num_camera and len(found.points) == 2
 
 
 def test_image_view_depth_is_z_depth() -> None:
@@ -97,9 +108,16 @@ def test_sweep_points_are_input_only() -> None:
     expected = frame_candidates(alone, POINT_RANGE, EGO_BOX, 0.5)
     assert np.array_equal(found.depth.directions, expected.depth.directions)
     assert np.array_equal(found.semantic[0].directions, expected.semantic[0].directions)
-    # No sweep point is held out; the own car's place now may hold points seen earlier.
+    # The own car's place now may hold points seen earlier.
     inside = (np.abs(frame.points[500:, :3]) < [20, 20, 3]).all(axis=1)
     assert len(found.points) == len(expected.points) + inside.sum()
+    # Sweeps in between hold nothing out; one that was a keyframe hides what its own token holds out.
+    frame.earlier_keyframes = {"earlier": slice(700, 900)}
+    shown = inside.copy()
+    shown[200:400] &= ~is_held_out(frame.point_index[700:900], "earlier", 0.5)
+    for held_out in (False, True):
+        found = frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.5, held_out=held_out)
+        assert np.array_equal(found.points, np.concatenate([expected.points, frame.points[500:][shown]]))
 
 
 def test_semantic_rays_pass_through_their_returns() -> None:

@@ -2,12 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import importlib.util
+import sys
 from collections.abc import Callable
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import pred
 from pred.data import sweeps
 
 EGO_BOX = (-1.0, -2.0, 1.0, 3.0)
@@ -46,6 +51,21 @@ def test_host_equals_numpy(num_points: int) -> None:
     expected, expected_kept = sweeps.place_sweep_reference(points, T, EGO_BOX, 0.05)
     assert np.array_equal(actual_kept, expected_kept)
     np.testing.assert_allclose(actual, expected, rtol=0, atol=4e-6)  # one rounding to float32 at 40 m
+
+
+def test_a_module_that_does_not_load_leaves_its_reason(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / f"_host{EXTENSION_SUFFIXES[0]}").write_bytes(b"junk")
+    monkeypatch.setattr(pred, "__path__", [str(tmp_path)])
+    monkeypatch.delattr(pred, "_host", raising=False)
+    monkeypatch.delitem(sys.modules, "pred._host", raising=False)
+    assert sweeps.__file__ is not None
+    spec = importlib.util.spec_from_file_location("another_sweeps", sweeps.__file__)
+    assert spec is not None and spec.loader is not None
+    another = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(another)
+    assert another._host is None and str(tmp_path / "_host") in another.HOST_ERROR
+    points = np.array([[5, 1, 0.5, 7, 31]], np.float32)
+    assert another.place_sweep(points, np.eye(4), EGO_BOX, 0.25)[0].tolist() == [[5, 1, 0.5, 7, 0.25]]
 
 
 def test_shapes_are_checked() -> None:

@@ -272,6 +272,14 @@ def test_frames_depend_on_seed_and_index_alone(loaded: list[Frame]) -> None:
     assert other.token(4) != alone.token(4) and digest(other.load(4)) != expected
 
 
+def test_without_labels_all_else_is_the_same(loaded: list[Frame]) -> None:
+    frames = StreetFrames(CONFIG, labels=False)
+    for frame in (frames.load(4), pickle.loads(pickle.dumps(frames)).load(4)):
+        assert [camera.labels for camera in frame.cameras] == [None] * 6
+        np.testing.assert_array_equal(frame.points, loaded[4].points)
+        np.testing.assert_array_equal(frame.cameras[0].load_image(), loaded[4].cameras[0].load_image())
+
+
 def test_another_process_makes_the_same_bits(loaded: list[Frame]) -> None:
     program = "\n".join(
         [

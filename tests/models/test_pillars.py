@@ -222,11 +222,21 @@ def test_bf16_autocast_keeps_coordinates_exact() -> None:
         ({"vfe_filters": []}, "vfe_filters must name at least one layer"),
         ({"vfe_filters": [7, 8]}, "vfe_filters must be even"),
         ({"pillar_size": (0.0, 1.0)}, "pillar_size must be positive"),
+        ({"pillar_size": (math.nan, 1.0)}, "pillar_size must be positive"),
+        ({"layer_nums": []}, "layer_nums must name at least one block"),
+        ({"layer_nums": [1, -1]}, r"layer_nums must be at least 0 everywhere, got \[1, -1\]"),
+        ({"vfe_filters": [8, 0]}, r"vfe_filters must be at least 1 everywhere, got \[8, 0\]"),
+        ({"layer_strides": [0, 2]}, "layer_strides must be at least 1 everywhere"),
+        ({"num_filters": [8, 0]}, "num_filters must be at least 1 everywhere"),
+        ({"num_upsample_filters": [-4, 6]}, "num_upsample_filters must be at least 1 everywhere"),
+        ({"upsample_strides": [0.0, 2]}, "upsample_strides must be positive and finite"),
+        ({"upsample_strides": [1, math.nan]}, "upsample_strides must be positive and finite"),
+        ({"upsample_strides": [1, math.inf]}, "upsample_strides must be positive and finite"),
     ],
 )
 def test_bad_configuration(changes: dict[str, object], message: str) -> None:
     sizes = {**vars(SMALL), **changes}
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=f"PillarEncoderConfig: {message}"):
         PillarEncoderConfig(**sizes)
 
 
@@ -238,4 +248,13 @@ def test_range_must_be_whole_pillars() -> None:
 def test_blocks_must_end_at_one_size() -> None:
     config = PillarEncoderConfig(**{**vars(SMALL), "upsample_strides": [1, 1]})
     with pytest.raises(ValueError, match=r"to one size, got \[\(8, 4\), \(4, 2\)\]"):
+        PillarEncoder(config, RANGE)
+
+
+@pytest.mark.parametrize("layer_strides, upsample_strides", [([8, 1], [1, 1]), ([4, 2], [1, 2]), ([4, 1], [0.5, 0.5])])
+def test_blocks_must_have_more_than_one_cell(layer_strides: list[int], upsample_strides: list[float]) -> None:
+    """Batch normalisation cannot train on one."""
+    sizes = {**vars(SMALL), "pillar_size": (1.0, 1.0)}
+    config = PillarEncoderConfig(**{**sizes, "layer_strides": layer_strides, "upsample_strides": upsample_strides})
+    with pytest.raises(ValueError, match="every block of a 8 x 8 grid more than one cell"):
         PillarEncoder(config, RANGE)

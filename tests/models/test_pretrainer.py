@@ -73,7 +73,7 @@ def toy_batch(num_frames: int = 2, num_rays: int = 24, num_points: int = 60, see
             target=F.one_hot(labels, 3).float(),
             confidence=torch.ones_like(depth_m),
         ),
-        skipped={},
+        skipped=[],
     )
 
 

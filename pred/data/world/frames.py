@@ -51,19 +51,21 @@ class StreetFrames:
     Args:
         config: sizes and seed.
         seed: replaces ``config.seed`` when given, for example to see other streets of the same kind.
+        labels: False: cameras without label maps (LiDAR-only).
     """
 
-    def __init__(self, config: StreetConfig, seed: int | None = None) -> None:
+    def __init__(self, config: StreetConfig, seed: int | None = None, labels: bool = True) -> None:
         self.config = config
         self.seed = config.seed if seed is None else seed
+        self.labels = labels
         # Streets come from a generator each, so a cache changes the time and nothing else. Eight streets take some
         # 70 MB, 400 label maps of the default size 36 MB.
         self._street = lru_cache(maxsize=8)(self._build_street)
-        self._labels = lru_cache(maxsize=400)(self._render_labels)
+        self._label_map = lru_cache(maxsize=400)(self._render_labels)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Scenes cannot be sent to another process, and need not be.
-        return StreetFrames, (self.config, self.seed)
+        return StreetFrames, (self.config, self.seed, self.labels)
 
     def __len__(self) -> int:
         return self.config.frames
@@ -106,7 +108,8 @@ class StreetFrames:
         width, height = self.config.image_width, self.config.image_height
         camera = sensors.mounted_camera(sensors.MOUNTS[mount], width, height)
         camera.image = partial(self._render_image, index, camera)
-        camera.labels = PseudoLabel(partial(self._labels, index, mount), width, height)
+        if self.labels:
+            camera.labels = PseudoLabel(partial(self._label_map, index, mount), width, height)
         return camera
 
     def _render_image(self, index: int, camera: Camera) -> NDArray[np.uint8]:

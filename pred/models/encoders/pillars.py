@@ -9,6 +9,7 @@ is (`vfe.…`, `backbone_2d.…`).
 N points, M pillars, B frames, D raw point channels, C feature channels.
 """
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -41,7 +42,7 @@ class PillarEncoderConfig:
     """Channels of each block's output in the concatenated map."""
 
     def __post_init__(self) -> None:
-        if min(self.pillar_size) <= 0:
+        if not all(size > 0 for size in self.pillar_size):
             raise ValueError(f"PillarEncoderConfig: pillar_size must be positive, got {tuple(self.pillar_size)}")
         if not self.vfe_filters:
             raise ValueError("PillarEncoderConfig: vfe_filters must name at least one layer, got []")
@@ -50,12 +51,24 @@ class PillarEncoderConfig:
                 f"PillarEncoderConfig: vfe_filters must be even for all but the last layer, got {self.vfe_filters}"
             )
         blocks = len(self.layer_nums)
+        if blocks == 0:
+            raise ValueError("PillarEncoderConfig: layer_nums must name at least one block, got []")
         for name in ("layer_strides", "num_filters", "upsample_strides", "num_upsample_filters"):
             if len(getattr(self, name)) != blocks:
                 raise ValueError(
                     f"PillarEncoderConfig: {name} must have one entry per block ({blocks}, as "
                     f"layer_nums), got {getattr(self, name)}"
                 )
+        for name in ("vfe_filters", "layer_nums", "layer_strides", "num_filters", "num_upsample_filters"):
+            minimum = 0 if name == "layer_nums" else 1
+            if min(getattr(self, name)) < minimum:
+                raise ValueError(
+                    f"PillarEncoderConfig: {name} must be at least {minimum} everywhere, got {getattr(self, name)}"
+                )
+        if not all(0 < stride < math.inf for stride in self.upsample_strides):
+            raise ValueError(
+                f"PillarEncoderConfig: upsample_strides must be positive and finite, got {self.upsample_strides}"
+            )
 
 
 class PillarEncoder(nn.Module):
@@ -194,7 +207,7 @@ class BEVBackbone(nn.Module):
         self.deblocks = nn.ModuleList()
         channels = config.vfe_filters[-1]
         size = grid_size
-        output_sizes = []
+        block_sizes, output_sizes = [], []
         for block, width in enumerate(config.num_filters):
             stride = config.layer_strides[block]
             # OpenPCDet pads in a layer of its own at index 0; the convolution pads as well and
@@ -205,6 +218,7 @@ class BEVBackbone(nn.Module):
             self.blocks.append(nn.Sequential(*layers))
             channels = width
             size = ((size[0] - 1) // stride + 1, (size[1] - 1) // stride + 1)
+            block_sizes.append(size)
 
             up = config.upsample_strides[block]
             if up >= 1:
@@ -224,6 +238,11 @@ class BEVBackbone(nn.Module):
             raise ValueError(
                 "PillarEncoder: layer_strides and upsample_strides must bring every block of a "
                 f"{grid_size[0]} x {grid_size[1]} grid to one size, got {output_sizes}"
+            )
+        if (1, 1) in [*block_sizes, *output_sizes]:  # batch normalisation of one frame needs two values
+            raise ValueError(
+                f"PillarEncoder: layer_strides and upsample_strides must leave every block of a {grid_size[0]} x "
+                f"{grid_size[1]} grid more than one cell, got {block_sizes} brought to {output_sizes}"
             )
 
     def forward(self, canvas: Tensor) -> Tensor:
