@@ -7,12 +7,17 @@ Imports that cost time stay inside the sub-commands, so that help and errors com
 
 from __future__ import annotations
 
+import ctypes
 import difflib
 import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""Names of mallopt() parameters, from glibc's malloc.h."""
+KEPT_BYTES = 1 << 30
 
 
 def pretrain(arguments: list[str]) -> None:
@@ -90,9 +95,7 @@ COMMANDS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a sub-command; returns the exit status (0 done, 1 failed, 2 wrong usage)."""
-    # Read by torch's OpenMP library when torch is imported. Its threads wait for each other in a busy loop, by default
-    # so long that a step takes many times as long where another program wants a core.
-    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+    _tune_process()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     name = arguments.pop(0) if arguments else "--help"
     if name in ("-h", "--help"):
@@ -119,6 +122,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"pred {name}: error: {error}\n(PRED_TRACEBACK=1 shows the traceback)", file=sys.stderr)
         return 1
     return 0
+
+
+def _tune_process() -> None:
+    """Settings of the C libraries below torch, which the environment may overrule."""
+    # Read by torch's OpenMP library when torch is imported. Its threads wait for each other in a busy loop, by default
+    # so long that a step takes many times as long where another program wants a core.
+    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+    # By default glibc returns the memory of every large tensor to the system, and the next one costs page faults again.
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    for variable, parameter in (
+        ("MALLOC_MMAP_THRESHOLD_", M_MMAP_THRESHOLD),
+        ("MALLOC_TRIM_THRESHOLD_", M_TRIM_THRESHOLD),
+    ):
+        if mallopt is not None and variable not in os.environ:
+            mallopt(parameter, KEPT_BYTES)
 
 
 def _options_of_run(

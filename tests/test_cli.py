@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -62,6 +63,33 @@ def test_threads_do_not_spin_for_long_unless_asked_to(monkeypatch: pytest.Monkey
     monkeypatch.setenv("GOMP_SPINCOUNT", "7")
     cli.main(["--version"])
     assert os.environ["GOMP_SPINCOUNT"] == "7"
+
+
+PAGE_FAULTS = """
+import resource, sys
+import numpy
+from pred import cli
+if "tuned" in sys.argv:
+    cli.main(["--version"])
+numpy.ones(40 << 20, "u1")
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(5):
+    numpy.ones(40 << 20, "u1")
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif("glibc" not in platform.libc_ver()[0], reason="glibc's malloc is what is tuned")
+def test_large_blocks_are_kept_by_the_process() -> None:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
+    environment["NUMPY_MADVISE_HUGEPAGE"] = "0"
+
+    def faults(*arguments: str) -> int:
+        command = [sys.executable, "-c", PAGE_FAULTS, *arguments]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return int(done.stdout.splitlines()[-1])
+
+    assert faults("tuned") < faults() / 10
 
 
 @pytest.mark.parametrize("name", ["pretrain", "evaluate", "view", "doctor"])

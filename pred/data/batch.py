@@ -106,8 +106,19 @@ class DataConfig:
             raise ValueError(f"data.ego_box must be (x_min, y_min, x_max, y_max), got {self.ego_box}")
 
 
+class _Parcel:
+    """Tensors go between processes by value: a loader's many small ones take milliseconds as shared memory."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: x.numpy() if isinstance(x, Tensor) else x for name, x in vars(self).items()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for name, x in state.items():
+            setattr(self, name, torch.from_numpy(x) if isinstance(x, np.ndarray) else x)
+
+
 @dataclass
-class Rays:
+class Rays(_Parcel):
     """R rays for each of B frames, in the frames' LiDAR coordinates.
 
     Attributes:
@@ -151,7 +162,7 @@ class SemanticRays(Rays):
 
 
 @dataclass
-class Batch:
+class Batch(_Parcel):
     """One training step's data.
 
     Attributes:

@@ -271,6 +271,7 @@ def test_workers_and_restarts_give_the_same_bits(tree: Tree) -> None:
         loader = make_loader(TrainingBatches(config, POINT_RANGE, 7, 6), workers=workers)
         found = list(loader)
         assert len(found) == len(loader) == 6
+        assert not any(batch.points.is_shared() for batch in found)  # sent by value
         for one, other in zip(found, expected, strict=True):
             assert_equal(one, other)
     resumed = list(make_loader(TrainingBatches(config, POINT_RANGE, 7, 6), start_step=4, workers=1))
