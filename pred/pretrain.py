@@ -308,7 +308,7 @@ def build_model(config: PretrainConfig) -> Pretrainer:
 def build_optimizer(model: torch.nn.Module, train: TrainConfig) -> AdamW:
     """AdamW over all parameters."""
     betas = (train.momentum_range[1], train.beta2)
-    return AdamW(model.parameters(), lr=train.lr, betas=betas, weight_decay=train.weight_decay)
+    return AdamW(model.parameters(), lr=train.lr, betas=betas, weight_decay=train.weight_decay, fused=True)
 
 
 def load_model(config: PretrainConfig, folder: RunFolder, checkpoint: Path | None = None) -> tuple[Pretrainer, Path]:
