@@ -157,9 +157,10 @@ static inline void section_ends(const Positions<T>& positions, int64_t num_new, 
   const T *u = row.u, *cdf = row.cdf;
   if (positions.spread == Spread::kRegular) {
     for (int64_t i = 0; i < row.size; ++i) {
-      const T place = cdf[i + 1] * T(num_new) - positions.shift;
-      const int32_t below = int32_t(place), end = below + (T(below) < place ? 1 : 0);
-      row.end[i] = cdf[i + 1] >= T(1) ? int32_t(num_new) : end;  // u that was clipped lies below 1 too
+      // u that was clipped lies below 1 too.
+      const T place = cdf[i + 1] >= T(1) ? T(num_new) : cdf[i + 1] * T(num_new) - positions.shift;
+      const int32_t below = int32_t(place);
+      row.end[i] = below + (T(below) < place ? 1 : 0);
     }
   } else if (positions.spread == Spread::kEven) {  // all u before the place of cdf_{i+1} are below it, none after it
     for (int64_t i = 0; i < row.size; ++i) {
