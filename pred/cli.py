@@ -32,6 +32,8 @@ def pretrain(arguments: list[str]) -> None:
     if parsed.resume is not None:
         folder = RunFolder(Path(parsed.resume))
         folder.require()
+        if parsed.run is not None and Path(parsed.run).resolve() != folder.path.resolve():
+            raise ValueError(f"run must not be given with --resume, which continues in {folder.path}, got {parsed.run}")
         parsed = parser.parse_args([f"--config={folder.config}", *arguments, f"--run={folder.path}"])
     run_pretraining(build(parser, PretrainConfig, parsed), resume=parsed.resume is not None)
 

@@ -281,6 +281,10 @@ def test_nuscenes_pillars_has_the_papers_values() -> None:
         (["evaluate", "rendering", "nowhere"], "nowhere: run folder must exist, got no such folder"),
         (["view", "nowhere"], "nowhere: run folder must exist, got no such folder"),
         (["pretrain", "--resume", "nowhere"], "nowhere: run folder must exist, got no such folder"),
+        (
+            ["pretrain", "--resume", "started", "--run", "other"],
+            "run must not be given with --resume, which continues in started, got other",
+        ),
         (["view", "empty"], "empty: run folder must hold config.yaml, got none"),
         (["view", "started"], "started/checkpoints: must hold a checkpoint, got none"),
         (["view", "started", "--checkpoint", "none.pt"], "none.pt: must exist, got no such file"),

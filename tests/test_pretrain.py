@@ -206,6 +206,34 @@ def test_killed_at_random_steps_and_resumed_equals_uninterrupted(tmp_path: Path)
     assert len(json.loads((broken / "run.json").read_text())["resumed"]) == 2, killed_at
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc; elsewhere loader processes may stay")
+def test_a_killed_run_takes_its_loader_processes_along(tmp_path: Path) -> None:
+    config = tiny_config(tmp_path / "run", steps=100_000)
+    config.data.workers = 2
+    config_file = write_config(tmp_path / "config.yaml", config)
+    run = subprocess.Popen([sys.executable, "-m", "pred", "pretrain", "--config", str(config_file)])
+    log, deadline = tmp_path / "run" / "log.csv", time.monotonic() + 120
+    while not (log.is_file() and len(log.read_text().splitlines()) > 3):
+        assert run.poll() is None and time.monotonic() < deadline
+        time.sleep(0.05)
+    workers = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
+    assert len(workers) == 2
+    time.sleep(0.5)  # their queues fill up
+    run.kill()
+    run.wait()
+    deadline = time.monotonic() + 10
+    while any(_runs(pid) for pid in workers):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def _runs(pid: str) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
 def test_resume_uses_the_previous_checkpoint_if_the_newest_is_damaged(
     finished: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

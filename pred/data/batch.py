@@ -4,8 +4,10 @@
 
 # No `from __future__ import annotations`: jsonargparse reads the field types of DataConfig.
 
+import ctypes
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -41,6 +43,9 @@ CACHED_FRAMES = 32
 
 WORKER_START = "fork" if sys.platform == "linux" else None
 """Forked workers share the tables of a data set."""
+
+PR_SET_PDEATHSIG = 1
+"""From linux/prctl.h: the signal that a process gets when its parent ends."""
 
 UPWARDS = (0.0, 0.0, 1.0)
 
@@ -292,17 +297,48 @@ class TrainingBatches(Dataset[Batch]):
         return candidates
 
 
+class _Loader(DataLoader[T]):
+    """Items of a data set in order. A `FrameError` of a loader process is raised as it is, without that process's
+    traceback, and loader processes end with this one, even if it is killed."""
+
+    def __init__(self, dataset: Dataset[T], order: Sequence[int], workers: int) -> None:
+        super().__init__(
+            _ErrorsAsItems(dataset),
+            batch_size=None,
+            sampler=order,
+            num_workers=workers,
+            multiprocessing_context=WORKER_START if workers else None,
+            collate_fn=_unchanged,
+            pin_memory=torch.cuda.is_available(),
+            worker_init_fn=_end_with_parent,
+        )
+
+    def __iter__(self) -> Iterator[T]:  # type: ignore[override]
+        for item in super().__iter__():
+            if isinstance(item, FrameError):
+                raise item
+            yield item
+
+
+class _ErrorsAsItems(Dataset[Any]):
+    def __init__(self, dataset: Dataset[Any]) -> None:
+        self._dataset = dataset
+
+    def __getitem__(self, index: int) -> Any:
+        try:
+            return self._dataset[index]
+        except FrameError as error:
+            return error
+
+
+def _end_with_parent(worker: int) -> None:
+    if sys.platform == "linux":  # elsewhere a worker may outlive a killed parent, waiting to hand over a batch
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
 def make_loader(dataset: TrainingBatches, start_step: int = 0, workers: int = 0) -> DataLoader[Batch]:
     """Batches of ``start_step`` and later in order; ``workers`` processes, 0 loads in this one."""
-    return DataLoader(
-        dataset,
-        batch_size=None,
-        sampler=range(start_step, len(dataset)),
-        num_workers=workers,
-        multiprocessing_context=WORKER_START if workers else None,
-        collate_fn=_unchanged,
-        pin_memory=torch.cuda.is_available(),
-    )
+    return _Loader(dataset, range(start_step, len(dataset)), workers)
 
 
 def build_source(config: DataConfig) -> FrameSource:
@@ -340,13 +376,7 @@ def count_classes(
     Raises:
         FrameError: a frame is broken and ``config.on_error`` is "raise".
     """
-    loader: DataLoader[NDArray[np.int64]] = DataLoader(
-        _ClassCounts(source, config, point_range, near_m),
-        batch_size=None,
-        num_workers=config.workers,
-        multiprocessing_context=WORKER_START if config.workers else None,
-        collate_fn=_unchanged,
-    )
+    loader = _Loader(_ClassCounts(source, config, point_range, near_m), range(len(source)), config.workers)
     counts = np.zeros(NUM_CLASSES, dtype=np.int64)
     for frame_counts in track(loader, "counting classes", len(source), disable=not show_progress):
         counts += frame_counts

@@ -37,18 +37,15 @@ ImageSource = Path | NDArray[np.uint8] | Callable[[], NDArray[np.uint8]]
 
 
 class FrameError(ValueError):
-    """A file of a frame cannot be used. The text names the file and what is wrong with it.
+    """A file of a frame cannot be used. The text names the file and what is wrong with it."""
 
-    ``what`` may be empty because loader workers rebuild the exception from its finished text alone.
-    """
-
-    def __init__(self, path: str | Path, what: str = "") -> None:
+    def __init__(self, path: str | Path, what: str) -> None:
         super().__init__(str(path), what)
         self.path = str(path)
         self.what = what
 
     def __str__(self) -> str:
-        return f"{self.path}: {self.what}" if self.what else self.path
+        return f"{self.path}: {self.what}"
 
 
 @dataclass

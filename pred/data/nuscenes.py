@@ -446,7 +446,9 @@ def _rigid(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _only_table_folder(root: Path) -> Path:
-    folders = sorted(path for path in root.glob("v[0-9]*") if path.is_dir())
+    if not root.is_dir():
+        raise FrameError(root, "data.root must be a folder, got no such folder")
+    folders = sorted(path for path in root.glob("v1.0-*") if path.is_dir())
     if len(folders) != 1:
         names = ", ".join(path.name for path in folders) or "none"
         raise FrameError(

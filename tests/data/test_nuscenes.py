@@ -129,6 +129,8 @@ def test_version_folder(tree: Tree) -> None:
         NuScenesFrames(tree.root, version="v1.0-mini")
     with pytest.raises(FrameError, match="must hold one table folder .* got none"):
         NuScenesFrames(tree.root / "samples")
+    with pytest.raises(FrameError, match="nowhere: data.root must be a folder, got no such folder"):
+        NuScenesFrames(tree.root / "nowhere")
 
 
 def test_splits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
