@@ -41,7 +41,7 @@ Tensor resample_rays(const Tensor& t_in, const Tensor& weights_in, const Tensor&
     const auto& k = kernels<T>();
     parallel(rays, 1 + 32768 / (samples + new_samples), [&](int64_t begin, int64_t end) {
       std::vector<T> scratch(k.scratch_size(a));
-      std::vector<int32_t> int_scratch(2 * samples + new_samples + 48);
+      std::vector<int32_t> int_scratch(k.int_scratch_size(a));
       k.resample(a, out, scratch.data(), int_scratch.data(), begin, end);
     });
     return merged;

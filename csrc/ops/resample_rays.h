@@ -24,8 +24,9 @@ struct ResampleRaysArgs {
 // Ranges count rays.
 template <typename T>
 struct ResampleRaysKernels {
-  int64_t (*scratch_size)(const ResampleRaysArgs<T>&);  // in elements, for one range
-  // merged [R, S + num_new]; int_scratch [2 S + num_new + 48]
+  int64_t (*scratch_size)(const ResampleRaysArgs<T>&);      // in elements, for one range
+  int64_t (*int_scratch_size)(const ResampleRaysArgs<T>&);  // likewise
+  // merged [R, S + num_new]
   void (*resample)(const ResampleRaysArgs<T>&, T* merged, T* scratch, int32_t* int_scratch, int64_t begin, int64_t end);
 };
 

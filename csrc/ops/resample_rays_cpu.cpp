@@ -37,12 +37,17 @@ struct Row {
   int64_t sections, size;  // size: padded
   T *t, *mass, *cdf, *slope, *u, *merged;
   int32_t* end;     // [size] c_{i+1}
-  int32_t* starts;  // [S + num_new] 1 where a section starts in the merged row, else 0
+  int32_t* starts;  // [S + num_new + kPad] 1 where a section starts in the merged row, else 0
 };
 
 template <typename T>
 static int64_t scratch_size(const ResampleRaysArgs<T>& a) {
   return 5 * (padded(a.num_samples) + 2 * kPad) + 2 * (a.num_new + 2 * kPad);
+}
+
+template <typename T>
+static int64_t int_scratch_size(const ResampleRaysArgs<T>& a) {
+  return padded(a.num_samples - 1) + a.num_samples + a.num_new + kPad;
 }
 
 template <typename T>
@@ -322,7 +327,8 @@ static void resample(const ResampleRaysArgs<T>& a, T* merged, T* scratch, int32_
 
 }  // namespace
 
-const ResampleRaysKernels<float> resample_rays_f32 = {scratch_size<float>, resample<float>};
-const ResampleRaysKernels<double> resample_rays_f64 = {scratch_size<double>, resample<double>};
+const ResampleRaysKernels<float> resample_rays_f32 = {scratch_size<float>, int_scratch_size<float>, resample<float>};
+const ResampleRaysKernels<double> resample_rays_f64 = {scratch_size<double>, int_scratch_size<double>,
+                                                       resample<double>};
 
 }  // namespace pred::PRED_ISA
