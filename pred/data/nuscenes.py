@@ -195,7 +195,7 @@ class NuScenesFrames:
             T_camera_from_lidar=invert_rigid(self._sensor_pose(row)) @ T_world_from_lidar,
             width=width,
             height=height,
-            image=image if image.is_file() else None,
+            image=image if labels is not None or image.is_file() else None,
             labels=labels,
         )
 

@@ -266,7 +266,7 @@ class _SumOfParts(torch.autograd.Function):
         inputs = [x.detach().requires_grad_(x.requires_grad) for x in tensors[:num_inputs]]
         leaves = [x for x in (*inputs, *tensors[num_inputs:]) if x.requires_grad]
         sums = [torch.zeros_like(leaf) for leaf in leaves]
-        total = torch.zeros_like(inputs[0].sum())
+        total = inputs[0].new_zeros(())
         with torch.enable_grad():
             for part in parts(*inputs):
                 gradients = torch.autograd.grad(part, leaves, allow_unused=True)

@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from pred.data.rays import NEAR_M
 from pred.models.field import FieldDecoder
 from pred.ops import composite_rays, resample_rays
 
@@ -31,7 +32,7 @@ class RendererConfig:
     """Stratified samples over the ray's way through the range box."""
     fine_samples: int = 128
     """Samples drawn from the coarse samples' weights and merged with them."""
-    near_m: float = 1.0
+    near_m: float = NEAR_M
     """Rays start so far from their origin, metres."""
     initial_inv_s: float = 2.7
     """Sharpness s of the sigmoid at the start of training, per metre."""
