@@ -19,8 +19,9 @@ from typing import Any
 
 import torch
 
-from benchmarks.bench_ops import CASES, KINDS, expected_results, make_cases, run_phase
+from benchmarks.bench_ops import CASES, expected_results, make_cases, run_phase
 from benchmarks.bench_step import run_step
+from benchmarks.case import KINDS
 from benchmarks.cases import SIZES
 from benchmarks.measure import (
     COPY_BYTES,

@@ -35,7 +35,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from benchmarks import cases
-from benchmarks.bench_ops import KINDS, compiled, first_line, missing_kernel
+from benchmarks.bench_ops import compiled, first_line, missing_kernel
+from benchmarks.case import KINDS
 from benchmarks.cases import SIZES, Sizes
 from benchmarks.measure import current_allocator, enter_allocator, time_interleaved
 from benchmarks.report import Row, Target

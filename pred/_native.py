@@ -132,11 +132,17 @@ def register(
 
     An op without ``backward`` raises by name when it is differentiated, since torch would otherwise leave the
     gradient out of a sum without a word. ``differentiable=False`` marks ops whose outputs carry no gradient at all.
+    Under ``torch.vmap`` every op raises by name, where torch would loop over the batch.
     """
     if not available():
         return
     name = f"pred::{op}"
     torch.library.register_fake(name, fake)
+
+    def refuse_vmap(*arguments: Any) -> None:
+        raise RuntimeError(f"{op}: torch.vmap is not supported; call it once on the whole batch")
+
+    torch.library.register_vmap(name, refuse_vmap)
     if not differentiable:
         return
     if backward is None:

@@ -17,7 +17,8 @@ import torch
 
 from benchmarks import bench_ops, bench_step, cases
 from benchmarks.__main__ import parse
-from benchmarks.bench_ops import BACKWARD, FORWARD, SECOND, Variant, expected_results, make_cases, run_phase
+from benchmarks.bench_ops import expected_results, make_cases, run_phase
+from benchmarks.case import BACKWARD, FORWARD, SECOND, Variant
 from benchmarks.cases import REAL, TINY
 from benchmarks.measure import Ceilings, Timing, time_interleaved
 from benchmarks.report import Row, Target, compare, format_comparisons, format_rows, format_table

@@ -43,6 +43,11 @@ def test_direct_calls_are_checked(native: None) -> None:
         torch.ops.pred.sample_bev(bev.half(), grid.half(), False, False)
 
 
+def test_vmap_is_refused_by_name(native: None) -> None:
+    with pytest.raises(RuntimeError, match="sample_bev: torch.vmap is not supported; call it once on the whole batch"):
+        torch.vmap(lambda bev, grid: sample_bev(bev, grid))(torch.zeros(2, 1, 3, 4, 5), torch.zeros(2, 1, 6, 2))
+
+
 def test_unknown_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PRED_BACKEND", "fast")
     with pytest.raises(ValueError, match="PRED_BACKEND must be auto, native or reference, got 'fast'"):

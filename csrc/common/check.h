@@ -14,6 +14,8 @@
 #include <string>
 #include <vector>
 
+#include "math/half.h"
+
 namespace pred {
 
 using torch::headeronly::ScalarType;
@@ -78,5 +80,45 @@ T read_sharpness(const char* op, const Tensor& inv_s, ScalarType dtype) {
         throw std::invalid_argument(std::string(op) + ": dtype must be float32 or float64"); \
     }                                                                                        \
   }()
+
+// Calls `body` with S = float, double, BFloat16 or Float16, the type of what is stored, and T = Compute<S>. Pointers to
+// storage: storage<S>(tensor), mutable_storage<S>(tensor).
+#define PRED_DISPATCH_STORAGE(op, dtype, ...)                                                                   \
+  [&] {                                                                                                         \
+    switch (dtype) {                                                                                            \
+      case ::pred::ScalarType::BFloat16: {                                                                      \
+        using S = ::pred::BFloat16;                                                                             \
+        using T [[maybe_unused]] = float;                                                                       \
+        return __VA_ARGS__();                                                                                   \
+      }                                                                                                         \
+      case ::pred::ScalarType::Half: {                                                                          \
+        using S = ::pred::Float16;                                                                              \
+        using T [[maybe_unused]] = float;                                                                       \
+        return __VA_ARGS__();                                                                                   \
+      }                                                                                                         \
+      case ::pred::ScalarType::Float: {                                                                         \
+        using S = float;                                                                                        \
+        using T [[maybe_unused]] = float;                                                                       \
+        return __VA_ARGS__();                                                                                   \
+      }                                                                                                         \
+      case ::pred::ScalarType::Double: {                                                                        \
+        using S = double;                                                                                       \
+        using T [[maybe_unused]] = double;                                                                      \
+        return __VA_ARGS__();                                                                                   \
+      }                                                                                                         \
+      default:                                                                                                  \
+        throw std::invalid_argument(std::string(op) + ": dtype must be float32, float64, bfloat16 or float16"); \
+    }                                                                                                           \
+  }()
+
+template <typename S>
+const S* storage(const Tensor& tensor) {
+  return static_cast<const S*>(tensor.const_data_ptr());
+}
+
+template <typename S>
+S* mutable_storage(const Tensor& tensor) {
+  return static_cast<S*>(tensor.mutable_data_ptr());
+}
 
 }  // namespace pred

@@ -1,0 +1,64 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a benchmark case is: one op on one input, in phases, and the ways to compute it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from benchmarks.report import Target
+
+FORWARD, BACKWARD, SECOND = "forward", "forward+backward", "second order"
+KINDS = ("ours", "eager", "compiled")
+
+Function = Callable[..., tuple[Tensor, ...]]
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A part of an op's work, its least traffic and its targets."""
+
+    name: str
+    traffic: str
+    """Formula of the bytes, in the letters of `pred.ops`."""
+    traffic_bytes: int
+    targets: tuple[Target, ...] = ()
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to compute a case."""
+
+    function: Function
+    inputs: tuple[Tensor, ...] | None = None
+    """Inputs in this variant's best memory format; None: the case's own."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One op on one input."""
+
+    op: str
+    name: str
+    unit: str
+    items: int
+    """Number of `unit`s in one call."""
+    inputs: tuple[Tensor, ...]
+    ours: Function
+    reference: Function
+    eager: dict[str, Variant]
+    """Plain PyTorch, by name; the fastest counts."""
+    compiled: tuple[str, ...]
+    """Which of them are compiled."""
+    phases: tuple[Phase, ...]
+    derivative_in: tuple[int, ...] = ()
+    """Positions of the inputs that take gradients."""
+    derivative_of: tuple[int, ...] = (0,)
+    """Positions of the outputs that a loss would use."""
+    tolerance: float = 1e-5
+    """Of every result, relative to its largest magnitude; 0: equal."""
+    outliers: float = 0.0
+    """Share of elements that may miss the tolerance, with the reason beside it."""
