@@ -12,6 +12,13 @@ from torch import Tensor
 FLOATING = (torch.float32, torch.float64)
 
 
+def check_tensors(op: str, **arguments: object) -> None:
+    """Each must be a tensor."""
+    for name, value in arguments.items():
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{op}: {name} must be a tensor, got {type(value).__name__}")
+
+
 def check_shape(op: str, name: str, tensor: Tensor, shape: Sequence[int | str], where: str = "") -> None:
     """``shape`` mixes exact sizes (int) and free ones (their letter)."""
     sizes = tensor.shape

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import check_choice, check_like, check_shape, widen
+from pred.ops._check import check_choice, check_like, check_shape, check_tensors, widen
 from pred.ops.sdf_to_alpha import sdf_arguments, sdf_to_alpha_reference, valid_sharpness
 
 
@@ -140,8 +140,9 @@ def _arguments(
     op = "composite_rays"
     check_choice(op, "depth_at", depth_at, ("start", "mid"))
     sdf, inv_s = sdf_arguments(op, sdf, inv_s, "pair", last)
+    check_tensors(op, t=t, **({} if values is None else {"values": values}))
     t = widen(t[..., 0] if t.dim() == 3 and t.shape[2] == 1 else t)
-    where = f" as sdf, with R={sdf.shape[0]} and S={sdf.shape[1]}"
+    where = " as sdf"  # without its sizes: a compiled graph would depend on them
     check_shape(op, "t", t, sdf.shape, where)
     check_like(op, "t", t, "sdf", sdf)
     if values is not None:

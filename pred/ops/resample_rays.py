@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, check_dtype, check_like, check_shape, widen
+from pred.ops._check import FLOATING, check_dtype, check_like, check_shape, check_tensors, widen
 
 
 def resample_rays(
@@ -78,6 +78,7 @@ def resample_rays_reference(
 
 def _arguments(t: Tensor, weights: Tensor, num_samples: int, u: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     op = "resample_rays"
+    check_tensors(op, t=t, weights=weights, **({} if u is None else {"u": u}))
     t, weights = (widen(x.detach()[..., 0] if x.dim() == 3 and x.shape[2] == 1 else x.detach()) for x in (t, weights))
     check_shape(op, "t", t, ("R", "S"))
     check_dtype(op, "t", t, FLOATING)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, check_choice, check_dtype, check_like, check_shape, widen
+from pred.ops._check import FLOATING, check_choice, check_dtype, check_like, check_shape, check_tensors, widen
 
 
 def sample_bev(
@@ -87,6 +87,7 @@ def sample_bev_reference(
 
 def _arguments(bev: Tensor, grid: Tensor, padding_mode: str) -> tuple[Tensor, Tensor]:
     op = "sample_bev"
+    check_tensors(op, bev=bev, grid=grid)
     bev, grid = widen(bev), widen(grid)
     check_shape(op, "bev", bev, ("B", "C", "H", "W"))
     check_shape(op, "grid", grid, (bev.shape[0], "N", 2))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, check_choice, check_dtype, check_shape, widen
+from pred.ops._check import FLOATING, check_choice, check_dtype, check_shape, check_tensors, widen
 
 
 def sdf_to_alpha(
@@ -67,6 +67,7 @@ def sdf_to_alpha_reference(
 
 def sdf_arguments(op: str, sdf: Tensor, inv_s: Tensor | float, mode: str, last: str) -> tuple[Tensor, Tensor]:
     """Checked ``sdf`` as ``[R, S]`` and ``inv_s`` as a tensor without dimensions, of one dtype."""
+    check_tensors(op, sdf=sdf)
     check_choice(op, "mode", mode, ("pair",))
     check_choice(op, "last", last, ("zero", "opaque"))
     if sdf.dim() == 3 and sdf.shape[2] == 1:

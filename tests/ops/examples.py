@@ -8,17 +8,21 @@ A new op is one builder and one entry (or a few) in EXAMPLES.
 from __future__ import annotations
 
 import inspect
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from pred import ops
 from pred.ops import reference
 
 HALF = (torch.bfloat16, torch.float16)
+NO_OP = {"build_info", "parallel_probe"}
+"""Registered in the library, but not for users."""
 PUBLIC = [name for name in ops.__all__ if inspect.isfunction(getattr(ops, name))]
 
 Arguments = dict[str, Any]
@@ -160,6 +164,11 @@ def grads(
     return [torch.zeros_like(x) if grad is None else grad for x, grad in zip(inputs, found, strict=True)]
 
 
+def order_of(example: Example) -> int:
+    """Derivatives to compute; second ones stand for any number."""
+    return 2 if example.order is None else example.order
+
+
 def _sample_bev(source: Source) -> Arguments:
     batch, channels = source.size(2, 0, 3), source.size(5, 0, 70)
     return {
@@ -266,3 +275,41 @@ EXAMPLES = [
         tolerance=20,
     ),
 ]
+
+
+class Recorder(TorchDispatchMode):
+    """Keeps the arguments of every ``torch.ops.pred`` call, once per op and kind of arguments."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: dict[str, dict[Any, tuple[Any, ...]]] = defaultdict(dict)
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func.namespace == "pred":
+            assert not kwargs
+            kind = tuple(
+                (value.dim(), value.dtype, value.numel() == 0) if isinstance(value, Tensor) else repr(value)
+                for value in args
+            )
+            if kind not in self.calls[func._opname]:
+                plain = tuple(value.detach().clone() if isinstance(value, Tensor) else value for value in args)
+                self.calls[func._opname][kind] = plain
+        return func(*args, **(kwargs or {}))
+
+
+def recorded_calls() -> dict[str, list[tuple[Any, ...]]]:
+    """Calls of every ``torch.ops.pred`` op that the examples and their derivatives make."""
+    recorder = Recorder()
+    for example in EXAMPLES:
+        for count in (0, 5):
+            for dtype in (torch.float32, *(HALF[:1] if example.features else ())):
+                arguments = example.example(count, dtype)
+                with recorder:
+                    evaluate(example.native, arguments, example.leaves(arguments), order_of(example))
+    return {name: list(calls.values()) for name, calls in recorder.calls.items()}
+
+
+def registered_ops() -> list[str]:
+    """Names in the library ``pred``, as the dispatcher knows them."""
+    names = [name.removeprefix("pred::") for name in torch._C._dispatch_get_all_op_names() if name.startswith("pred::")]
+    return sorted(set(names) - NO_OP)

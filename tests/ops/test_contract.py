@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
@@ -12,15 +11,24 @@ import pytest
 import torch
 import torch._dynamo.utils
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from pred.ops import reference
-from tests.ops.examples import EXAMPLES, HALF, PUBLIC, Arguments, Example, evaluate, grads, outputs
+from tests.ops.examples import (
+    EXAMPLES,
+    HALF,
+    PUBLIC,
+    Arguments,
+    Example,
+    evaluate,
+    grads,
+    order_of,
+    outputs,
+    recorded_calls,
+    registered_ops,
+)
 from tests.tolerances import FORWARD, GRADIENT, assert_close
 
 DTYPES = [torch.float32, torch.float64]
-WITHOUT_EXAMPLE = {"build_info", "parallel_probe"}
-"""Registered names that are no op on tensors of a user."""
 
 every_example = pytest.mark.parametrize("example", EXAMPLES, ids=str)
 
@@ -31,11 +39,6 @@ def widened(arguments: Arguments) -> Arguments:
         name: value.double() if isinstance(value, Tensor) and value.is_floating_point() else value
         for name, value in arguments.items()
     }
-
-
-def order_of(example: Example) -> int:
-    """Derivatives to compare; second ones stand for all."""
-    return 2 if example.order is None else example.order
 
 
 def assert_like_reference(example: Example, arguments: Arguments) -> None:
@@ -256,44 +259,6 @@ def test_outputs_without_derivative_carry_none(backend: str, example: Example) -
         for name, value in arguments.items()
     }
     assert not any(value.requires_grad for value in outputs(example.native(**held)).values())
-
-
-class Recorder(TorchDispatchMode):
-    """Keeps the arguments of every ``torch.ops.pred`` call, once per op and kind of arguments."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.calls: dict[str, dict[Any, tuple[Any, ...]]] = defaultdict(dict)
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func.namespace == "pred":
-            assert not kwargs
-            kind = tuple(
-                (value.dim(), value.dtype, value.numel() == 0) if isinstance(value, Tensor) else repr(value)
-                for value in args
-            )
-            if kind not in self.calls[func._opname]:
-                plain = tuple(value.detach().clone() if isinstance(value, Tensor) else value for value in args)
-                self.calls[func._opname][kind] = plain
-        return func(*args, **(kwargs or {}))
-
-
-def recorded_calls() -> dict[str, list[tuple[Any, ...]]]:
-    """Calls of every ``torch.ops.pred`` op that the examples and their derivatives make."""
-    recorder = Recorder()
-    for example in EXAMPLES:
-        for count in (0, 5):
-            for dtype in (torch.float32, *(HALF[:1] if example.features else ())):
-                arguments = example.example(count, dtype)
-                with recorder:
-                    evaluate(example.native, arguments, example.leaves(arguments), order_of(example))
-    return {name: list(calls.values()) for name, calls in recorder.calls.items()}
-
-
-def registered_ops() -> list[str]:
-    """Names in the library ``pred``, as the dispatcher knows them."""
-    names = [name.removeprefix("pred::") for name in torch._C._dispatch_get_all_op_names() if name.startswith("pred::")]
-    return sorted(set(names) - WITHOUT_EXAMPLE)
 
 
 @pytest.fixture(scope="module")
