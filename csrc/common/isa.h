@@ -69,3 +69,17 @@ const Table& pick(Isa isa, const Table& baseline, const Table& avx2, const Table
     else                                    \
       return PRED_KERNELS(name##_f64);      \
   }
+
+// The same for the types of PRED_DISPATCH_STORAGE (tables name_f32, name_f64, name_bf16, name_f16), as a static member.
+#define PRED_STORAGE_KERNELS(Table, name)          \
+  template <typename S>                            \
+  static const Table<S>& kernels() {               \
+    if constexpr (std::is_same_v<S, BFloat16>)     \
+      return PRED_KERNELS(name##_bf16);            \
+    else if constexpr (std::is_same_v<S, Float16>) \
+      return PRED_KERNELS(name##_f16);             \
+    else if constexpr (std::is_same_v<S, float>)   \
+      return PRED_KERNELS(name##_f32);             \
+    else                                           \
+      return PRED_KERNELS(name##_f64);             \
+  }
