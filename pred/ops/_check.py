@@ -48,3 +48,23 @@ def check_choice(op: str, name: str, value: str, choices: Sequence[str]) -> None
     """``value`` must be one of ``choices``."""
     if value not in choices:
         raise ValueError(f"{op}: {name} must be one of {', '.join(choices)}, got {value!r}")
+
+
+def check_offsets(op: str, name: str, offsets: Tensor, letters: str, other_name: str, other: Tensor) -> None:
+    """``offsets`` must be int64 and ascend from 0 to the rows of ``other``; values are looked at in eager CPU calls.
+
+    ``letters``: of what the offsets divide the rows into, and of the rows, such as ``"RP"`` for rays and samples.
+    """
+    parts, rows = letters[0], letters[1]
+    check_shape(op, name, offsets, (f"{parts} + 1",))
+    check_dtype(op, name, offsets, (torch.int64,))
+    if offsets.device != other.device:
+        raise ValueError(f"{op}: {name} must be on the device of {other_name} ({other.device}), got {offsets.device}")
+    if offsets.shape[0] == 0:
+        raise ValueError(f"{op}: {name} must have shape [{parts} + 1] with {parts} >= 0, got [0]")
+    if torch.compiler.is_compiling() or offsets.device.type != "cpu":
+        return
+    count = other.shape[0]
+    if offsets[0] != 0 or offsets[-1] != count or (offsets[1:] < offsets[:-1]).any():
+        shown = offsets.tolist() if offsets.shape[0] <= 16 else f"{offsets[:8].tolist()} ... {int(offsets[-1])}"
+        raise ValueError(f"{op}: {name} must ascend from 0 to {rows}={count}, got {shown}")
