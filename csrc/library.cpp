@@ -58,13 +58,21 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "(Tensor, Tensor)");
 
   m.def(
-      "composite_rays(Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, bool depth_mid, bool last_opaque) -> "
-      "(Tensor weights, Tensor depth, Tensor opacity, Tensor values, Tensor remaining)");
+      "composite_rays(Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, Tensor? ray_offsets, bool depth_mid, "
+      "bool last_opaque) -> (Tensor weights, Tensor depth, Tensor opacity, Tensor values, Tensor remaining)");
   m.def(
       "composite_rays_backward(Tensor? grad_weights, Tensor? grad_depth, Tensor? grad_opacity, Tensor? grad_values, "
-      "Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, Tensor weights, Tensor remaining, bool depth_mid, "
-      "bool last_opaque, bool need_sdf, bool need_inv_s, bool need_t, bool need_values) -> "
+      "Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, Tensor? ray_offsets, Tensor weights, Tensor remaining, "
+      "bool depth_mid, bool last_opaque, bool need_sdf, bool need_inv_s, bool need_t, bool need_values) -> "
       "(Tensor, Tensor, Tensor, Tensor)");
+
+  m.def(
+      "composite_alpha(Tensor alpha, Tensor? t, Tensor? values, Tensor? ray_offsets, float eps, bool depth_mid) -> "
+      "(Tensor weights, Tensor depth, Tensor opacity, Tensor values)");
+  m.def(
+      "composite_alpha_backward(Tensor? grad_weights, Tensor? grad_depth, Tensor? grad_opacity, Tensor? grad_values, "
+      "Tensor alpha, Tensor? t, Tensor? values, Tensor? ray_offsets, float eps, bool depth_mid, bool need_alpha, "
+      "bool need_t, bool need_values) -> (Tensor, Tensor, Tensor)");
 
   m.def("resample_rays(Tensor t, Tensor weights, Tensor u) -> Tensor");
 }

@@ -70,16 +70,16 @@ const Table& pick(Isa isa, const Table& baseline, const Table& avx2, const Table
       return PRED_KERNELS(name##_f64);      \
   }
 
-// The same for the types of PRED_DISPATCH_STORAGE (tables name_f32, name_f64, name_bf16, name_f16), as a static member.
-#define PRED_STORAGE_KERNELS(Table, name)          \
-  template <typename S>                            \
-  static const Table<S>& kernels() {               \
-    if constexpr (std::is_same_v<S, BFloat16>)     \
-      return PRED_KERNELS(name##_bf16);            \
-    else if constexpr (std::is_same_v<S, Float16>) \
-      return PRED_KERNELS(name##_f16);             \
-    else if constexpr (std::is_same_v<S, float>)   \
-      return PRED_KERNELS(name##_f32);             \
-    else                                           \
-      return PRED_KERNELS(name##_f64);             \
+// The same for tables by storage type (math/half.h): name_f32, name_f64, name_bf16 or name_f16.
+#define PRED_KERNELS_BY_STORAGE(Table, name)        \
+  template <typename S>                             \
+  const Table<S>& kernels() {                       \
+    if constexpr (std::is_same_v<S, float>)         \
+      return PRED_KERNELS(name##_f32);              \
+    else if constexpr (std::is_same_v<S, double>)   \
+      return PRED_KERNELS(name##_f64);              \
+    else if constexpr (std::is_same_v<S, BFloat16>) \
+      return PRED_KERNELS(name##_bf16);             \
+    else                                            \
+      return PRED_KERNELS(name##_f16);              \
   }

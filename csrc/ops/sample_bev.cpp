@@ -5,11 +5,16 @@
 namespace pred {
 namespace {
 
+PRED_KERNELS_BY_STORAGE(SampleBevKernels, sample_bev)
+
 struct Bev {
   static constexpr int kAxes = 2;
   static constexpr const char* kName = "sample_bev";
   static constexpr const char* kMap = "bev";
-  PRED_STORAGE_KERNELS(SampleBevKernels, sample_bev)
+  template <typename S>
+  static const SampleBevKernels<S>& table() {
+    return kernels<S>();
+  }
 };
 using SampleBev = SampleGrid<Bev>;
 

@@ -117,7 +117,7 @@ struct SampleGrid {
       const Inputs<S> in("", map, grid, border, align_corners);
       Tensor out = torch::stable::new_empty(map, {in.batch, in.args.num_samples, in.args.channels});
       S* data = mutable_storage<S>(out);
-      const auto& k = Op::template kernels<S>();
+      const auto& k = Op::template table<S>();
       parallel(in.num_samples(), in.grain(),
                [&](int64_t begin, int64_t end) { k.forward(in.args, data, nullptr, begin, end); });
       return out;
@@ -132,7 +132,7 @@ struct SampleGrid {
       Tensor slopes = torch::stable::new_empty(map, {in.batch, samples, kAxes, channels});
       S* data = mutable_storage<S>(out);
       S* slope_data = mutable_storage<S>(slopes);
-      const auto& k = Op::template kernels<S>();
+      const auto& k = Op::template table<S>();
       parallel(in.num_samples(), in.grain(),
                [&](int64_t begin, int64_t end) { k.forward(in.args, data, slope_data, begin, end); });
       return std::make_tuple(out, slopes);
@@ -169,7 +169,7 @@ struct SampleGrid {
       S* grad_data = need_grad ? mutable_storage<S>(out_grad) : nullptr;
       T* grid_data = need_grid ? mutable_storage<T>(out_grid) : nullptr;
       if (need_grad || need_grid) {
-        const auto& k = Op::template kernels<S>();
+        const auto& k = Op::template table<S>();
         parallel(in.num_samples(), in.grain(),
                  [&](int64_t begin, int64_t end) { k.double_backward(a, grad_data, grid_data, begin, end); });
       }
@@ -218,7 +218,7 @@ struct SampleGrid {
         if (need_grid) torch::stable::zero_(grad_grid);  // samples that touch nothing are not visited
         grad_map = scatter<S>(in, false, data);
       } else if (need_grid) {
-        const auto& k = Op::template kernels<S>();
+        const auto& k = Op::template table<S>();
         parallel(in.num_samples(), in.grain(),
                  [&](int64_t begin, int64_t end) { k.backward_grid(in.args, data, begin, end); });
       }
@@ -231,7 +231,7 @@ struct SampleGrid {
   static Tensor scatter(const Inputs<S>& in, bool along_direction, Compute<S>* grad_grid) {
     constexpr int64_t kBandRows = 8;
     const auto& a = in.args;
-    const auto& k = Op::template kernels<S>();
+    const auto& k = Op::template table<S>();
     SampleGridOrder order{nullptr, bits_for(in.num_samples()), {}};
     int cell_bits = 0;
     for (int axis = 0; axis < kAxes; ++axis) {

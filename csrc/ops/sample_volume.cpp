@@ -5,11 +5,16 @@
 namespace pred {
 namespace {
 
+PRED_KERNELS_BY_STORAGE(SampleVolumeKernels, sample_volume)
+
 struct Volume {
   static constexpr int kAxes = 3;
   static constexpr const char* kName = "sample_volume";
   static constexpr const char* kMap = "volume";
-  PRED_STORAGE_KERNELS(SampleVolumeKernels, sample_volume)
+  template <typename S>
+  static const SampleVolumeKernels<S>& table() {
+    return kernels<S>();
+  }
 };
 using SampleVolume = SampleGrid<Volume>;
 

@@ -12,9 +12,17 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, check_choice, check_dtype, check_like, check_shape, check_tensors, widen
-
-HALF = (torch.bfloat16, torch.float16)
+from pred.ops._check import (
+    FLOATING,
+    HALF,
+    as_geometry,
+    check_choice,
+    check_dtype,
+    check_like,
+    check_shape,
+    check_tensors,
+    widen,
+)
 
 
 class SampledWithGrad(NamedTuple):
@@ -27,15 +35,11 @@ class SampledWithGrad(NamedTuple):
 def arguments(op: str, name: str, axes: int, map_: Tensor, grid: Tensor, padding_mode: str) -> tuple[Tensor, Tensor]:
     """Checked map, here named as the caller knows it, and grid; a half-precision grid is widened to float32."""
     check_tensors(op, **{name: map_, "grid": grid})
-    map_, grid = widen(map_), grid.float() if grid.dtype in HALF else grid
+    map_, grid = widen(map_), as_geometry(grid)
     check_shape(op, name, map_, ("B", "C", "D", "H", "W") if axes == 3 else ("B", "C", "H", "W"))
     check_shape(op, "grid", grid, (map_.shape[0], "N", axes))
     check_dtype(op, name, map_, (*FLOATING, *HALF))
-    if map_.dtype in HALF:
-        check_dtype(op, "grid", grid, (torch.float32,))
-        check_like(op, "grid", grid, name, map_.new_empty(0, dtype=torch.float32))
-    else:
-        check_like(op, "grid", grid, name, map_)
+    check_like(op, "grid", grid, name, map_.new_empty(0, dtype=torch.float32) if map_.dtype in HALF else map_)
     check_choice(op, "padding_mode", padding_mode, ("zeros", "border"))
     if 0 in map_.shape[2:]:
         what = "layer, row and column" if axes == 3 else "row and column"

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The plain PyTorch references of all ops, under the ops' own names."""
 
+from pred.ops.composite_alpha import composite_alpha_reference as composite_alpha
 from pred.ops.composite_rays import composite_rays_reference as composite_rays
 from pred.ops.resample_rays import resample_rays_reference as resample_rays
 from pred.ops.sample_bev import sample_bev_reference as sample_bev
@@ -13,6 +14,7 @@ from pred.ops.segment_reduce import segment_reduce_reference as segment_reduce
 from pred.ops.voxelize import voxelize_reference as voxelize
 
 __all__ = [
+    "composite_alpha",
     "composite_rays",
     "resample_rays",
     "sample_bev",
