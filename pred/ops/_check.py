@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 FLOATING = (torch.float32, torch.float64)
+HALF = (torch.bfloat16, torch.float16)
 
 
 def check_shape(op: str, name: str, tensor: Tensor, shape: Sequence[int | str], where: str = "") -> None:
@@ -42,6 +43,28 @@ def widen(tensor: Tensor) -> Tensor:
     """In a half-precision (autocast) region: the tensor in float32 if it is narrower."""
     half = tensor.dtype in (torch.bfloat16, torch.float16)
     return tensor.float() if half and torch.is_autocast_enabled(tensor.device.type) else tensor
+
+
+def as_geometry(tensor: Tensor) -> Tensor:
+    """In float32 if it is narrower: distances, ranges and weights are too coarse in half precision."""
+    return tensor.float() if tensor.dtype in HALF else tensor
+
+
+def check_offsets(op: str, name: str, offsets: Tensor, rows: str, size: str, owner_name: str, owner: Tensor) -> None:
+    """``offsets`` must be ``[rows + 1]`` int64 on the device of ``owner``, ascending from 0 to its first size; values
+    are looked at where that is free."""
+    check_shape(op, name, offsets, (f"{rows} + 1",))
+    check_dtype(op, name, offsets, (torch.int64,))
+    if offsets.device != owner.device:
+        raise ValueError(f"{op}: {name} must be on the device of {owner_name} ({owner.device}), got {offsets.device}")
+    if offsets.shape[0] == 0:
+        raise ValueError(f"{op}: {name} must have shape [{rows} + 1] with {rows} >= 0, got [0]")
+    if torch.compiler.is_compiling() or offsets.device.type != "cpu":
+        return
+    total = owner.shape[0]
+    if offsets[0] != 0 or offsets[-1] != total or (offsets[1:] < offsets[:-1]).any():
+        shown = str(offsets.tolist()) if len(offsets) <= 16 else f"{offsets[:8].tolist()} ... {int(offsets[-1])}"
+        raise ValueError(f"{op}: {name} must ascend from 0 to {size}={total}, got {shown}")
 
 
 def check_choice(op: str, name: str, value: str, choices: Sequence[str]) -> None:
