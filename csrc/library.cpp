@@ -58,7 +58,12 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "bool last_opaque, bool need_sdf, bool need_inv_s, bool need_t, bool need_values) -> "
       "(Tensor, Tensor, Tensor, Tensor)");
 
-  m.def("resample_rays(Tensor t, Tensor weights, Tensor u) -> Tensor");
+  m.def(
+      "sample_pdf(Tensor edges, Tensor weights, Tensor u, str mode, float histogram_padding, float eps, "
+      "float min_width) -> Tensor");
+  m.def(
+      "resample_rays(Tensor t, Tensor weights, Tensor u, str mode, float histogram_padding, float eps, "
+      "float min_width) -> Tensor");
 }
 
 namespace pred {

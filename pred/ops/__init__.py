@@ -10,6 +10,7 @@ module, which is its fallback and its oracle; :mod:`pred.ops.reference` gathers 
 from pred.ops.composite_rays import Composite, composite_rays
 from pred.ops.resample_rays import resample_rays
 from pred.ops.sample_bev import sample_bev
+from pred.ops.sample_pdf import sample_pdf
 from pred.ops.sdf_to_alpha import sdf_to_alpha
 from pred.ops.segment_reduce import segment_reduce
 from pred.ops.voxelize import Voxels, voxelize
@@ -20,6 +21,7 @@ __all__ = [
     "composite_rays",
     "resample_rays",
     "sample_bev",
+    "sample_pdf",
     "sdf_to_alpha",
     "segment_reduce",
     "voxelize",
