@@ -52,10 +52,21 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "voxelize(Tensor points, Tensor batch_offsets, float[] voxel_size, float[] point_range, int[] grid_size) -> "
       "(Tensor, Tensor, Tensor)");
 
-  m.def("sdf_to_alpha(Tensor sdf, Tensor inv_s, bool last_opaque) -> Tensor");
+  m.def("sdf_to_alpha(Tensor sdf, Tensor inv_s, bool last_opaque, Tensor? ray_offsets=None) -> Tensor");
   m.def(
-      "sdf_to_alpha_backward(Tensor grad, Tensor sdf, Tensor inv_s, bool need_sdf, bool need_inv_s) -> "
-      "(Tensor, Tensor)");
+      "sdf_to_alpha_backward(Tensor grad, Tensor sdf, Tensor inv_s, bool need_sdf, bool need_inv_s, "
+      "Tensor? ray_offsets=None) -> (Tensor, Tensor)");
+  m.def(
+      "sdf_to_alpha_section(Tensor sdf, Tensor inv_s, Tensor cosine, Tensor section_length, Tensor cos_anneal, "
+      "float eps) -> Tensor");
+  m.def(
+      "sdf_to_alpha_section_backward(Tensor grad, Tensor sdf, Tensor inv_s, Tensor cosine, Tensor section_length, "
+      "Tensor cos_anneal, float eps, bool need_sdf, bool need_inv_s, bool need_cosine, bool need_section_length) -> "
+      "(Tensor, Tensor, Tensor, Tensor)");
+  m.def("sdf_to_alpha_density(Tensor density, Tensor section_length) -> Tensor");
+  m.def(
+      "sdf_to_alpha_density_backward(Tensor grad, Tensor density, Tensor section_length, bool need_density, "
+      "bool need_section_length) -> (Tensor, Tensor)");
 
   m.def(
       "composite_rays(Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, Tensor? ray_offsets, bool depth_mid, "
@@ -74,7 +85,12 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "Tensor alpha, Tensor? t, Tensor? values, Tensor? ray_offsets, float eps, bool depth_mid, bool need_alpha, "
       "bool need_t, bool need_values) -> (Tensor, Tensor, Tensor)");
 
-  m.def("resample_rays(Tensor t, Tensor weights, Tensor u) -> Tensor");
+  m.def(
+      "sample_pdf(Tensor edges, Tensor weights, Tensor u, str mode, float histogram_padding, float eps, "
+      "float min_width) -> Tensor");
+  m.def(
+      "resample_rays(Tensor t, Tensor weights, Tensor u, str mode, float histogram_padding, float eps, "
+      "float min_width) -> Tensor");
 }
 
 namespace pred {

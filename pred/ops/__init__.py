@@ -14,6 +14,7 @@ from pred.ops.composite_alpha import composite_alpha
 from pred.ops.composite_rays import composite_rays
 from pred.ops.resample_rays import resample_rays
 from pred.ops.sample_bev import sample_bev, sample_bev_with_grad
+from pred.ops.sample_pdf import sample_pdf
 from pred.ops.sample_volume import sample_volume, sample_volume_with_grad
 from pred.ops.sdf_to_alpha import sdf_to_alpha
 from pred.ops.segment_reduce import segment_reduce
@@ -28,6 +29,7 @@ __all__ = [
     "resample_rays",
     "sample_bev",
     "sample_bev_with_grad",
+    "sample_pdf",
     "sample_volume",
     "sample_volume_with_grad",
     "sdf_to_alpha",

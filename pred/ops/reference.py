@@ -7,6 +7,7 @@ from pred.ops.composite_rays import composite_rays_reference as composite_rays
 from pred.ops.resample_rays import resample_rays_reference as resample_rays
 from pred.ops.sample_bev import sample_bev_reference as sample_bev
 from pred.ops.sample_bev import sample_bev_with_grad_reference as sample_bev_with_grad
+from pred.ops.sample_pdf import sample_pdf_reference as sample_pdf
 from pred.ops.sample_volume import sample_volume_reference as sample_volume
 from pred.ops.sample_volume import sample_volume_with_grad_reference as sample_volume_with_grad
 from pred.ops.sdf_to_alpha import sdf_to_alpha_reference as sdf_to_alpha
@@ -19,6 +20,7 @@ __all__ = [
     "resample_rays",
     "sample_bev",
     "sample_bev_with_grad",
+    "sample_pdf",
     "sample_volume",
     "sample_volume_with_grad",
     "sdf_to_alpha",
