@@ -27,6 +27,9 @@ from pred import _native
 ROOT = Path(__file__).resolve().parent.parent
 PHASES = {
     "sample_bev": {FORWARD, BACKWARD, SECOND},
+    "sample_bev_with_grad": {FORWARD, BACKWARD},
+    "sample_volume": {FORWARD, BACKWARD, SECOND},
+    "sample_volume_with_grad": {FORWARD, BACKWARD},
     "sdf_to_alpha": {FORWARD, BACKWARD},
     "composite_rays": {FORWARD, BACKWARD},
     "resample_rays": {FORWARD},
@@ -53,7 +56,8 @@ def check_rows(rows: list[dict[str, Any]]) -> None:
         timing = row["timing"]
         assert 0 < timing["q25_s"] <= timing["median_s"] <= timing["q75_s"], name
         assert timing["samples"] >= len(timing["round_medians_s"]) == 3, name
-        assert row["error"] is not None and row["error"] < 1e-3, name
+        limit = 1e-2 if "bfloat16" in row["case"] else 1e-3  # neighbouring bfloat16 numbers are 4e-3 to 8e-3 apart
+        assert row["error"] is not None and row["error"] < limit, name
         assert row["items"] > 0 and row["rates"]["items_per_s"] == pytest.approx(row["items"] / timing["median_s"])
         assert (row["traffic_bytes"] > 0 and row["traffic"]) or (row["flop"] > 0 and row["work"]), name
 
@@ -169,7 +173,7 @@ def test_contenders_take_turns() -> None:
 
 
 def test_traffic_formulas() -> None:
-    (bev, _) = make_cases("sample_bev", TINY)
+    bev, *_ = make_cases("sample_bev", TINY)
     height_width_channels, samples, rows = 12 * 12 * 8, 64, 64 * 8
     assert [phase.traffic_bytes for phase in bev.phases] == [
         4 * (height_width_channels + 2 * samples + rows),
