@@ -50,8 +50,9 @@ def composite_arguments(
         check_offsets(op, "ray_offsets", ray_offsets, "RP", name, source)
     if t is not None:
         t = geometry(t, packed)
-        sizes = f"P={source.shape[0]}" if packed else f"R={source.shape[0]} and S={source.shape[1]}"
-        check_shape(op, "t", t, source.shape, f" as {name}, with {sizes}")
+        if t.shape != source.shape:  # or the sizes in the text would be constants of a compiled graph
+            sizes = f"P={source.shape[0]}" if packed else f"R={source.shape[0]} and S={source.shape[1]}"
+            check_shape(op, "t", t, source.shape, f" as {name}, with {sizes}")
         check_like(op, "t", t, name, source)
     if values is not None:
         values = widen(values)
