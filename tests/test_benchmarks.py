@@ -28,6 +28,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PHASES = {
     "sample_bev": {FORWARD, BACKWARD, SECOND},
     "sdf_to_alpha": {FORWARD, BACKWARD},
+    "composite_alpha": {FORWARD, BACKWARD},
     "composite_rays": {FORWARD, BACKWARD},
     "resample_rays": {FORWARD},
     "voxelize": {FORWARD},
@@ -53,7 +54,8 @@ def check_rows(rows: list[dict[str, Any]]) -> None:
         timing = row["timing"]
         assert 0 < timing["q25_s"] <= timing["median_s"] <= timing["q75_s"], name
         assert timing["samples"] >= len(timing["round_medians_s"]) == 3, name
-        assert row["error"] is not None and row["error"] < 1e-3, name
+        limit = 2**-7 if "bfloat16" in row["case"] else 1e-3
+        assert row["error"] is not None and row["error"] < limit, name
         assert row["items"] > 0 and row["rates"]["items_per_s"] == pytest.approx(row["items"] / timing["median_s"])
         assert (row["traffic_bytes"] > 0 and row["traffic"]) or (row["flop"] > 0 and row["work"]), name
 
@@ -176,7 +178,7 @@ def test_traffic_formulas() -> None:
         4 * (3 * height_width_channels + 6 * samples + 2 * rows),
         4 * (4 * height_width_channels + 12 * samples + 5 * rows),
     ]
-    depth, classes = make_cases("composite_rays", TINY)
+    depth, classes, *_ = make_cases("composite_rays", TINY)
     assert [phase.traffic_bytes for phase in depth.phases] == [4 * 3 * 5 * 14, 4 * 6 * 5 * 14]
     assert [phase.traffic_bytes for phase in classes.phases] == [4 * (3 + 19) * 5 * 14, 4 * (6 + 3 * 19) * 5 * 14]
     (resample,) = make_cases("resample_rays", TINY)
