@@ -48,10 +48,10 @@ def _composite_rays_cases(sizes: Sizes) -> list[Case]:
     variants = {"cumprod": Variant(_eager_composite_cumprod), "cumsum": Variant(_eager_composite_cumsum)}
 
     def ours(*inputs: Tensor) -> tuple[Tensor, ...]:
-        return tuple(tensor for tensor in ops.composite_rays(*inputs) if tensor is not None)
+        return _present(ops.composite_rays(*inputs))
 
     def plain(*inputs: Tensor) -> tuple[Tensor, ...]:
-        return tuple(tensor for tensor in reference.composite_rays(*inputs) if tensor is not None)
+        return _present(reference.composite_rays(*inputs))
 
     return [
         Case(
@@ -95,7 +95,128 @@ def _composite_rays_cases(sizes: Sizes) -> list[Case]:
                 ),
             ),
         ),
+        Case(
+            op="composite_rays",
+            name=f"composite_rays {rays}x{samples}, depth and {sizes.classes} classes in bfloat16",
+            unit="rays",
+            items=rays,
+            inputs=(sdf, inv_s, t, values.bfloat16()),
+            ours=ours,
+            reference=plain,
+            eager=variants,
+            compiled=tuple(variants),
+            derivative_in=(0, 3),
+            derivative_of=(1, 3),
+            tolerance=2**-7,  # neighbouring bfloat16 numbers
+            phases=(
+                Phase(FORWARD, "4 (3 RS) + 2 RSC", 3 * plane + block // 2),
+                Phase(BACKWARD, "4 (6 RS) + 2 (3 RSC)", 6 * plane + 3 * block // 2),
+            ),
+        ),
+        *_packed_composite_rays_cases(sizes),
     ]
+
+
+def _packed_composite_rays_cases(sizes: Sizes) -> list[Case]:
+    sdf, inv_s, t, ray_offsets, values = cases.packed_ray_samples(sizes)
+    rays, line, block = ray_offsets.shape[0] - 1, sdf.nbytes, values.nbytes
+    variants = {"padded": Variant(_eager_composite_padded), "log space": Variant(_eager_composite_log_space)}
+
+    def ours(sdf: Tensor, inv_s: Tensor, t: Tensor, ray_offsets: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
+        return _present(ops.composite_rays(sdf, inv_s, t, *values, ray_offsets=ray_offsets))
+
+    def plain(sdf: Tensor, inv_s: Tensor, t: Tensor, ray_offsets: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
+        return _present(reference.composite_rays(sdf, inv_s, t, *values, ray_offsets=ray_offsets))
+
+    name = f"composite_rays packed, {rays} rays of {sdf.shape[0]} samples"
+    return [
+        Case(
+            op="composite_rays",
+            name=f"{name}, depth only",
+            unit="rays",
+            items=rays,
+            inputs=(sdf, inv_s, t, ray_offsets),
+            ours=ours,
+            reference=plain,
+            eager=variants,
+            compiled=(),  # the longest ray is not known to a compiler
+            derivative_in=(0,),
+            derivative_of=(1,),
+            phases=(Phase(FORWARD, "4 (3 P)", 3 * line), Phase(BACKWARD, "4 (6 P)", 6 * line)),
+        ),
+        Case(
+            op="composite_rays",
+            name=f"{name}, depth and {sizes.classes} classes",
+            unit="rays",
+            items=rays,
+            inputs=(sdf, inv_s, t, ray_offsets, values),
+            ours=ours,
+            reference=plain,
+            eager=variants,
+            compiled=(),
+            derivative_in=(0, 4),
+            derivative_of=(1, 3),
+            phases=(
+                Phase(FORWARD, "4 (3 P + PC)", 3 * line + block),
+                Phase(BACKWARD, "4 (6 P + 3 PC)", 6 * line + 3 * block),
+            ),
+        ),
+    ]
+
+
+def _composite_alpha_cases(sizes: Sizes) -> list[Case]:
+    sdf, inv_s, t, values = cases.ray_samples(sizes)
+    alpha = F.pad(_eager_alpha(sdf, inv_s), (0, 1))
+    rays, samples = alpha.shape
+    plane, block = alpha.nbytes, values.nbytes
+    variants = {
+        "cumprod": Variant(_eager_composite_alpha_cumprod),
+        "exclusive cumprod": Variant(_eager_composite_alpha_exclusive),
+    }
+
+    def ours(*inputs: Tensor) -> tuple[Tensor, ...]:
+        return _present(ops.composite_alpha(*inputs))
+
+    def plain(*inputs: Tensor) -> tuple[Tensor, ...]:
+        return _present(reference.composite_alpha(*inputs))
+
+    return [
+        Case(
+            op="composite_alpha",
+            name=f"composite_alpha {rays}x{samples}, depth only",
+            unit="rays",
+            items=rays,
+            inputs=(alpha, t),
+            ours=ours,
+            reference=plain,
+            eager=variants,
+            compiled=tuple(variants),
+            derivative_in=(0,),
+            derivative_of=(1,),
+            phases=(Phase(FORWARD, "4 (3 RS)", 3 * plane), Phase(BACKWARD, "4 (6 RS)", 6 * plane)),
+        ),
+        Case(
+            op="composite_alpha",
+            name=f"composite_alpha {rays}x{samples}, depth and {sizes.classes} classes",
+            unit="rays",
+            items=rays,
+            inputs=(alpha, t, values),
+            ours=ours,
+            reference=plain,
+            eager=variants,
+            compiled=tuple(variants),
+            derivative_in=(0, 2),
+            derivative_of=(1, 3),
+            phases=(
+                Phase(FORWARD, "4 (3 RS + RSC)", 3 * plane + block),
+                Phase(BACKWARD, "4 (6 RS + 3 RSC)", 6 * plane + 3 * block),
+            ),
+        ),
+    ]
+
+
+def _present(composite: ops.Composite) -> tuple[Tensor, ...]:
+    return tuple(tensor for tensor in composite if tensor is not None)
 
 
 def _eager_alpha(sdf: Tensor, inv_s: Tensor) -> Tensor:  # [R, S - 1]
@@ -120,9 +241,62 @@ def _eager_composite_cumsum(sdf: Tensor, inv_s: Tensor, t: Tensor, values: Tenso
 
 
 def _eager_sums(weights: Tensor, t: Tensor, values: Tensor | None) -> tuple[Tensor, ...]:
-    weights = F.pad(weights, (0, 1))
+    return _eager_all_sums(F.pad(weights, (0, 1)), t, values)
+
+
+def _eager_all_sums(weights: Tensor, t: Tensor, values: Tensor | None) -> tuple[Tensor, ...]:
     sums = weights, (weights * t).sum(dim=1), weights.sum(dim=1)
-    return sums if values is None else (*sums, torch.bmm(weights[:, None], values)[:, 0])
+    if values is None:
+        return sums
+    rendered = torch.bmm(weights[:, None], values.to(weights.dtype))[:, 0]
+    return *sums, rendered.to(values.dtype)
+
+
+def _eager_composite_alpha_cumprod(alpha: Tensor, t: Tensor, values: Tensor | None = None) -> tuple[Tensor, ...]:
+    """As NeuS does."""
+    clear = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], dim=1), dim=1)[:, :-1]
+    return _eager_all_sums(alpha * clear, t, values)
+
+
+def _eager_composite_alpha_exclusive(alpha: Tensor, t: Tensor, values: Tensor | None = None) -> tuple[Tensor, ...]:
+    clear = torch.cumprod(1 - alpha[:, :-1], dim=1)
+    return _eager_all_sums(torch.cat([alpha[:, :1], alpha[:, 1:] * clear], dim=1), t, values)
+
+
+def _eager_composite_padded(
+    sdf: Tensor, inv_s: Tensor, t: Tensor, ray_offsets: Tensor, values: Tensor | None = None
+) -> tuple[Tensor, ...]:
+    """Rows as long as the longest ray; the padding's distance lets everything pass."""
+    counts = ray_offsets.diff()
+    valid = torch.arange(int(counts.max())) < counts[:, None]
+
+    def pad(samples: Tensor, fill: float) -> Tensor:
+        return samples.new_full((*valid.shape, *samples.shape[1:]), fill).masked_scatter_(
+            valid.view(*valid.shape, *[1] * (samples.dim() - 1)), samples
+        )
+
+    table = None if values is None else pad(values, 0.0)
+    weights, *sums = _eager_composite_cumprod(pad(sdf, 1e4), inv_s, pad(t, 0.0), table)
+    return weights[valid], *sums
+
+
+def _eager_composite_log_space(
+    sdf: Tensor, inv_s: Tensor, t: Tensor, ray_offsets: Tensor, values: Tensor | None = None
+) -> tuple[Tensor, ...]:
+    """One running sum of log(1 - alpha) over all rays, less what it was at each ray's start; in double, or the first
+    rays' sums would cost the last ones their digits."""
+    counts = ray_offsets.diff()
+    rays = counts.shape[0]
+    ray = torch.repeat_interleave(torch.arange(rays), counts)
+    inside = F.pad((ray[1:] == ray[:-1]).to(sdf.dtype), (0, 1))
+    alpha = F.pad(_eager_alpha(sdf[None], inv_s)[0], (0, 1)) * inside
+    passed = F.pad(torch.cumsum(torch.log1p(-alpha).double(), dim=0), (1, 0))
+    weights = alpha * torch.exp(passed[:-1] - passed[ray_offsets[:-1]][ray]).to(sdf.dtype)
+    sums = (sdf.new_zeros(rays).index_add(0, ray, weights * t), sdf.new_zeros(rays).index_add(0, ray, weights))
+    if values is None:
+        return weights, *sums
+    rendered = values.new_zeros(rays, values.shape[1]).index_add(0, ray, weights[:, None] * values)
+    return weights, *sums, rendered
 
 
 def _resample_rays_cases(sizes: Sizes) -> list[Case]:
@@ -170,6 +344,7 @@ def _eager_resample(t: Tensor, weights: Tensor, added: int) -> Tensor:
 
 CASES: dict[str, Callable[[Sizes], list[Case]]] = {
     "sdf_to_alpha": _sdf_to_alpha_cases,
+    "composite_alpha": _composite_alpha_cases,
     "composite_rays": _composite_rays_cases,
     "resample_rays": _resample_rays_cases,
 }

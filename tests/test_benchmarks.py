@@ -31,6 +31,7 @@ PHASES = {
     "sample_volume": {FORWARD, BACKWARD, SECOND},
     "sample_volume_with_grad": {FORWARD, BACKWARD},
     "sdf_to_alpha": {FORWARD, BACKWARD},
+    "composite_alpha": {FORWARD, BACKWARD},
     "composite_rays": {FORWARD, BACKWARD},
     "resample_rays": {FORWARD},
     "voxelize": {FORWARD},
@@ -180,7 +181,7 @@ def test_traffic_formulas() -> None:
         4 * (3 * height_width_channels + 6 * samples + 2 * rows),
         4 * (4 * height_width_channels + 12 * samples + 5 * rows),
     ]
-    depth, classes = make_cases("composite_rays", TINY)
+    depth, classes, *_ = make_cases("composite_rays", TINY)
     assert [phase.traffic_bytes for phase in depth.phases] == [4 * 3 * 5 * 14, 4 * 6 * 5 * 14]
     assert [phase.traffic_bytes for phase in classes.phases] == [4 * (3 + 19) * 5 * 14, 4 * (6 + 3 * 19) * 5 * 14]
     (resample,) = make_cases("resample_rays", TINY)
