@@ -138,12 +138,13 @@ def _time_block(run: Callable[[], object], threads: int, min_time_s: float) -> _
     torch.set_num_threads(threads)
     if isinstance(run, Run) and run.before is not None:
         return _time_prepared_block(run.before, run.call, min_time_s)
+    call = run.call if isinstance(run, Run) else run
     calls = 0
 
     def counted() -> None:
         nonlocal calls
         calls += 1
-        run()
+        call()
 
     faults = _page_faults()
     processor_time, start_time = time.process_time(), time.perf_counter()
