@@ -246,9 +246,9 @@ def row(contender: str, kind: str, times: Timing | None, memory: int | None = No
 def test_comparison_is_with_the_fastest_eager_and_against_the_targets() -> None:
     ceilings = {2: Ceilings(2, copy_bytes_per_s=1e6, matrix_flop_per_s=1e9)}
     rows = [
-        row("ours", "ours", timing(0.01, 0.02, 0.03), memory=100),
+        row("ours", "ours", timing(0.01, 0.02, 0.03), memory=100_000_000),
         row("eager slow", "eager", timing(0.1, 0.1, 0.1)),
-        row("eager fast", "eager", timing(0.05, 0.06, 0.06), memory=300),
+        row("eager fast", "eager", timing(0.05, 0.06, 0.06), memory=300_000_000),
         row("compiled x", "compiled", None),
     ]
     (comparison,) = compare(rows, ceilings)
