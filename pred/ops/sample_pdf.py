@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, as_geometry, check_choice, check_dtype, check_like, check_shape
+from pred.ops._check import FLOATING, as_geometry, check_choice, check_dtype, check_like, check_shape, check_tensors
 
 MODES = ("exact", "neus", "nerfstudio")
 
@@ -147,6 +147,7 @@ def pdf_arguments(
     min_width: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Checked ``edges`` (called ``name``), ``weights`` and ``u``, detached."""
+    check_tensors(op, **{name: edges, "weights": weights}, **({} if u is None else {"u": u}))
     check_choice(op, "mode", mode, MODES)
     for option, value in (("histogram_padding", histogram_padding), ("eps", eps), ("min_width", min_width)):
         if not 0 <= value < math.inf:

@@ -11,7 +11,16 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, as_geometry, check_choice, check_dtype, check_like, check_offsets, check_shape
+from pred.ops._check import (
+    FLOATING,
+    as_geometry,
+    check_choice,
+    check_dtype,
+    check_like,
+    check_offsets,
+    check_shape,
+    check_tensors,
+)
 
 
 def sdf_to_alpha(
@@ -176,13 +185,15 @@ def _flat(tensor: Tensor) -> Tensor:
 
 def _elementwise(name: str, first: Tensor, **others: Tensor | None) -> list[Tensor]:
     """``first``, ``[R, S]`` or ``[P]``, and other tensors of its shape."""
-    op, first = "sdf_to_alpha", _flat(first)
+    op = "sdf_to_alpha"
+    check_tensors(op, **{name: first}, **others)
+    first = _flat(first)
     if first.dim() not in (1, 2):
         raise ValueError(f"{op}: {name} must have shape [R, S], [R, S, 1] or [P], got {list(first.shape)}")
     check_dtype(op, name, first, FLOATING)
     tensors = [first]
     for other_name, other in others.items():
-        assert other is not None
+        assert other is not None  # by _check_mode
         tensors.append(_flat(other))
         check_shape(op, other_name, tensors[-1], first.shape, f" as {name}")
         check_like(op, other_name, tensors[-1], name, first)
@@ -200,13 +211,14 @@ def sdf_arguments(
     op: str, sdf: Tensor, inv_s: Tensor | float, mode: str, last: str, ray_offsets: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Checked ``sdf`` of mode pair as ``[R, S]`` or ``[P]`` and ``inv_s`` without dimensions, of one dtype."""
+    check_tensors(op, sdf=sdf, **({} if ray_offsets is None else {"ray_offsets": ray_offsets}))
     check_choice(op, "mode", mode, ("pair",))
     check_choice(op, "last", last, ("zero", "opaque"))
     sdf = _flat(sdf)
     check_shape(op, "sdf", sdf, ("R", "S") if ray_offsets is None else ("P",))
     check_dtype(op, "sdf", sdf, FLOATING)
     if ray_offsets is not None:
-        check_offsets(op, "ray_offsets", ray_offsets, "R", "P", "sdf", sdf)
+        check_offsets(op, "ray_offsets", ray_offsets, "RP", "sdf", sdf)
     return sdf, _sharpness(op, inv_s, sdf)
 
 
