@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -12,8 +14,13 @@ from torch import Tensor
 from pred.ops import reference, resample_rays, sample_pdf
 from tests.tolerances import assert_close
 
-UNIPAD = {"mode": "nerfstudio", "histogram_padding": 0.0, "min_width": 1e-5}
-RULES = {"exact": {"mode": "exact"}, "neus": {"mode": "neus"}, "nerfstudio": {"mode": "nerfstudio"}, "unipad": UNIPAD}
+UNIPAD: dict[str, Any] = {"mode": "nerfstudio", "histogram_padding": 0.0, "min_width": 1e-5}
+RULES: dict[str, dict[str, Any]] = {
+    "exact": {"mode": "exact"},
+    "neus": {"mode": "neus"},
+    "nerfstudio": {"mode": "nerfstudio"},
+    "unipad": UNIPAD,
+}
 
 
 def case(num_rays: int = 6, edges: int = 24, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
@@ -25,7 +32,7 @@ def case(num_rays: int = 6, edges: int = 24, dtype: torch.dtype = torch.float64)
 
 
 def call(name: str, edges: Tensor, weights: Tensor, n: int | None = None, u: Tensor | None = None) -> Tensor:
-    return sample_pdf(edges, weights, n, u, **RULES[name])  # type: ignore[arg-type]
+    return sample_pdf(edges, weights, n, u, **RULES[name])
 
 
 # --- the published formulas, written out -----------------------------------------------------------------------------
@@ -72,7 +79,11 @@ def nerfstudio(bins: Tensor, weights: Tensor, u: Tensor, unipad: bool = False) -
     return bin_below + t * (bin_above - bin_below)
 
 
-PUBLISHED = {"neus": neus, "nerfstudio": nerfstudio, "unipad": functools.partial(nerfstudio, unipad=True)}
+PUBLISHED: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
+    "neus": neus,
+    "nerfstudio": nerfstudio,
+    "unipad": functools.partial(nerfstudio, unipad=True),
+}
 
 
 def assert_samples(actual: Tensor, expected: Tensor, edges: Tensor, mass: Tensor, tolerance: float) -> None:
@@ -130,7 +141,7 @@ def test_native_equals_reference(level: str, shape: tuple[int, int, int], name: 
             weights.double(),
             n,
             None if given is None else given.double(),
-            **RULES[name],  # type: ignore[arg-type]
+            **RULES[name],
         )
         assert actual.dtype == dtype
         assert_close(actual.double(), expected, 2e-5 if dtype == torch.float32 else 1e-11)
@@ -249,7 +260,7 @@ def test_resample_rays_is_samples_and_sort(level: str, name: str) -> None:
         edges[4, 7] = torch.nan
         for given in (None, u, u.sort(dim=1).values):
             merged = torch.cat([edges, call(name, edges, weights, 30, given)], dim=1).sort(dim=1, stable=True).values
-            actual = resample_rays(edges, weights, 30, given, **RULES[name])  # type: ignore[arg-type]
+            actual = resample_rays(edges, weights, 30, given, **RULES[name])
             if name in PUBLISHED:
                 assert torch.equal(actual[actual.isfinite()], merged[merged.isfinite()])
             assert_close(actual, merged, tolerance)
@@ -286,7 +297,7 @@ def test_one_graph_for_any_size(backend: str, name: str) -> None:
     torch._dynamo.reset()
 
     def both(edges: Tensor, weights: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        merged = resample_rays(edges, weights, u.shape[1], u, **RULES[name])  # type: ignore[arg-type]
+        merged = resample_rays(edges, weights, u.shape[1], u, **RULES[name])
         return call(name, edges, weights, u=u), merged
 
     compiled = torch.compile(both, fullgraph=True, backend=counter)
@@ -303,7 +314,7 @@ def test_bitwise_equal_for_any_thread_count(native: None, name: str) -> None:
     found = []
     for threads in (1, 2, 7):
         torch.set_num_threads(threads)
-        found.append((call(name, edges, weights, 128), resample_rays(edges, weights, 128, **RULES[name])))  # type: ignore[arg-type]
+        found.append((call(name, edges, weights, 128), resample_rays(edges, weights, 128, **RULES[name])))
     for other in found[1:]:
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
