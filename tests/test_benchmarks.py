@@ -36,6 +36,7 @@ PHASES = {
     "composite_alpha": {FORWARD, BACKWARD},
     "composite_rays": {FORWARD, BACKWARD},
     "resample_rays": {FORWARD},
+    "sample_pdf": {FORWARD},
     "voxelize": {FORWARD},
     "segment_reduce": {FORWARD, BACKWARD},
     "step": {BACKWARD},
@@ -127,7 +128,7 @@ def test_default_allocator_runs_beside(tmp_path: Path) -> None:
 
 
 def test_compiled_runs_or_says_why_not() -> None:
-    (case,) = make_cases("sdf_to_alpha", TINY)
+    (case, *_) = make_cases("sdf_to_alpha", TINY)
     phase = case.phases[0]
     (row,) = run_phase(case, phase, expected_results(case, phase), 1, ["compiled"], 0.005, 3, lambda step: None)
     assert row.contender == "compiled closed form"
