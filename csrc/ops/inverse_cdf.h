@@ -33,15 +33,14 @@ struct Limits<double> {
 // at the end.
 template <typename T>
 struct Row {
-  int64_t sections, size;  // size: padded
-  T *t, *mass, *cdf, *slope, *u, *out;
-  int32_t *low, *high;  // [size + num_new] each, at least
+  int64_t sections, size;               // size: padded
+  T *t, *mass, *cdf, *slope, *u, *out;  // out: room for S + num_new
+  int32_t *low, *high;                  // [size + num_new] each, at least
 };
 
-// For `num_out` elements of `out`.
 template <typename T>
-static int64_t row_scratch_size(int64_t num_samples, int64_t num_new, int64_t num_out) {
-  return 4 * (padded(num_samples) + 2 * kPad) + (num_new + 2 * kPad) + (num_out + 3 * kPad);
+static int64_t row_scratch_size(int64_t num_samples, int64_t num_new) {
+  return 5 * (padded(num_samples) + 2 * kPad) + 2 * (num_new + 2 * kPad);
 }
 
 static int64_t row_int_scratch_size(int64_t num_samples, int64_t num_new) {
