@@ -35,7 +35,7 @@ template <typename T>
 struct Row {
   int64_t sections, size;               // size: padded
   T *t, *mass, *cdf, *slope, *u, *out;  // out: room for S + num_new
-  int32_t *low, *high;                  // [size + num_new] each, at least
+  int32_t *low, *high;                  // of the search; resample_rays has another use for this room
 };
 
 template <typename T>
@@ -44,7 +44,7 @@ static int64_t row_scratch_size(int64_t num_samples, int64_t num_new) {
 }
 
 static int64_t row_int_scratch_size(int64_t num_samples, int64_t num_new) {
-  return 2 * (padded(num_samples) + num_new + kPad);
+  return padded(num_samples - 1) + num_samples + num_new + kPad + (num_new > num_samples ? num_new - num_samples : 0);
 }
 
 template <typename T>
@@ -62,7 +62,7 @@ static Row<T> make_row(int64_t num_samples, int64_t num_new, T* scratch, int32_t
           u,
           u + num_new + kPad,
           int_scratch,
-          int_scratch + padded(num_samples) + num_new + kPad};
+          int_scratch + num_new};
 }
 
 // To [0, 1); keeps NaN.
