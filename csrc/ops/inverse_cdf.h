@@ -33,19 +33,18 @@ struct Limits<double> {
 // at the end.
 template <typename T>
 struct Row {
-  int64_t sections, size;  // size: padded
-  T *t, *mass, *cdf, *slope, *u, *out;
-  int32_t *low, *high;  // [size + num_new] each, at least
+  int64_t sections, size;               // size: padded
+  T *t, *mass, *cdf, *slope, *u, *out;  // out: room for S + num_new
+  int32_t *low, *high;                  // of the search; resample_rays has another use for this room
 };
 
-// For `num_out` elements of `out`.
 template <typename T>
-static int64_t row_scratch_size(int64_t num_samples, int64_t num_new, int64_t num_out) {
-  return 4 * (padded(num_samples) + 2 * kPad) + (num_new + 2 * kPad) + (num_out + 3 * kPad);
+static int64_t row_scratch_size(int64_t num_samples, int64_t num_new) {
+  return 5 * (padded(num_samples) + 2 * kPad) + 2 * (num_new + 2 * kPad);
 }
 
 static int64_t row_int_scratch_size(int64_t num_samples, int64_t num_new) {
-  return 2 * (padded(num_samples) + num_new + kPad);
+  return padded(num_samples - 1) + num_samples + num_new + kPad + (num_new > num_samples ? num_new - num_samples : 0);
 }
 
 template <typename T>
@@ -63,7 +62,7 @@ static Row<T> make_row(int64_t num_samples, int64_t num_new, T* scratch, int32_t
           u,
           u + num_new + kPad,
           int_scratch,
-          int_scratch + padded(num_samples) + num_new + kPad};
+          int_scratch + num_new};
 }
 
 // To [0, 1); keeps NaN.

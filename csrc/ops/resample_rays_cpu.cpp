@@ -14,13 +14,12 @@ namespace {
 
 template <typename T>
 static int64_t scratch_size(const ResampleRaysArgs<T>& a) {
-  return row_scratch_size<T>(a.num_samples, a.num_new, a.num_samples + a.num_new);
+  return row_scratch_size<T>(a.num_samples, a.num_new);
 }
 
-// A row's, and for each place of the merged row whether a section starts there.
 template <typename T>
 static int64_t int_scratch_size(const ResampleRaysArgs<T>& a) {
-  return row_int_scratch_size(a.num_samples, a.num_new) + a.num_samples + a.num_new + kPad;
+  return row_int_scratch_size(a.num_samples, a.num_new);
 }
 
 // How a row of u lies.
@@ -194,7 +193,8 @@ template <typename T>
 static void resample_exact(const ResampleRaysArgs<T>& a, T* merged, T* scratch, int32_t* int_scratch, int64_t begin,
                            int64_t end) {
   const Row<T> row = make_row(a.num_samples, a.num_new, scratch, int_scratch);
-  int32_t* starts_at = int_scratch + row_int_scratch_size(a.num_samples, a.num_new);
+  // Whether a section starts at each place of the merged row; lies over what the search would need.
+  int32_t* starts_at = row.low + row.size;
   const int64_t out_size = a.num_samples + a.num_new;
   Positions<T> positions{};
   for (int64_t ray = begin; ray < end; ++ray) {

@@ -10,7 +10,7 @@ namespace {
 
 template <typename T>
 static int64_t scratch_size(const SamplePdfArgs<T>& a) {
-  return row_scratch_size<T>(a.num_edges, a.num_new, 0);
+  return row_scratch_size<T>(a.num_edges, a.num_new);
 }
 
 template <typename T>
