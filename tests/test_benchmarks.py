@@ -16,17 +16,20 @@ import pytest
 import torch
 
 from benchmarks import bench_ops, bench_step, cases
-from benchmarks.__main__ import parse
 from benchmarks.bench_ops import expected_results, make_cases, run_phase
 from benchmarks.case import BACKWARD, FORWARD, SECOND, Variant
 from benchmarks.cases import REAL, TINY
 from benchmarks.measure import Ceilings, Timing, time_interleaved
-from benchmarks.report import Row, Target, compare, format_comparisons, format_rows, format_table
+from benchmarks.options import parse
+from benchmarks.report import Row, Table, Target, compare, comparison_table, row_table
 from pred import _native
 
 ROOT = Path(__file__).resolve().parent.parent
 PHASES = {
     "sample_bev": {FORWARD, BACKWARD, SECOND},
+    "sample_bev_with_grad": {FORWARD, BACKWARD},
+    "sample_volume": {FORWARD, BACKWARD, SECOND},
+    "sample_volume_with_grad": {FORWARD, BACKWARD},
     "sdf_to_alpha": {FORWARD, BACKWARD},
     "composite_alpha": {FORWARD, BACKWARD},
     "composite_rays": {FORWARD, BACKWARD},
@@ -54,7 +57,7 @@ def check_rows(rows: list[dict[str, Any]]) -> None:
         timing = row["timing"]
         assert 0 < timing["q25_s"] <= timing["median_s"] <= timing["q75_s"], name
         assert timing["samples"] >= len(timing["round_medians_s"]) == 3, name
-        limit = 2**-7 if "bfloat16" in row["case"] else 1e-3
+        limit = 1e-2 if "bfloat16" in row["case"] else 1e-3  # neighbouring bfloat16 numbers are 4e-3 to 8e-3 apart
         assert row["error"] is not None and row["error"] < limit, name
         assert row["items"] > 0 and row["rates"]["items_per_s"] == pytest.approx(row["items"] / timing["median_s"])
         assert (row["traffic_bytes"] > 0 and row["traffic"]) or (row["flop"] > 0 and row["work"]), name
@@ -171,7 +174,7 @@ def test_contenders_take_turns() -> None:
 
 
 def test_traffic_formulas() -> None:
-    (bev, _) = make_cases("sample_bev", TINY)
+    bev, *_ = make_cases("sample_bev", TINY)
     height_width_channels, samples, rows = 12 * 12 * 8, 64, 64 * 8
     assert [phase.traffic_bytes for phase in bev.phases] == [
         4 * (height_width_channels + 2 * samples + rows),
@@ -246,15 +249,15 @@ def test_comparison_is_with_the_fastest_eager_and_against_the_targets() -> None:
         "copy bandwidth": (pytest.approx(0.4), False),  # 8000 bytes in 0.02 s of 1e6 per second
         "eager's memory": (pytest.approx(3.0), False),
     }
-    shown = format_comparisons([comparison])
+    shown = comparison_table([comparison]).text()
     assert "3x eager: met (3.00x); 2x compiled: not measured" in shown
     assert "50% of copy bandwidth: falls short (40%); 1/4 of eager's memory: falls short (1/3.00)" in shown
-    table = format_rows(rows, ceilings)
+    table = row_table(rows, ceilings).text()
     assert "50k rays/s" in table and "40% copy" in table and "refused: no" in table
 
 
 def test_table_is_aligned() -> None:
-    assert format_table(["a", "empty", "b"], [["long", "", "1"], ["x", "", "23"]], right=(2,)).splitlines() == [
+    assert Table(("a", "empty", "b"), [["long", "", "1"], ["x", "", "23"]], right=(2,)).text().splitlines() == [
         "a      b",
         "----  --",
         "long   1",

@@ -70,7 +70,7 @@ const Table& pick(Isa isa, const Table& baseline, const Table& avx2, const Table
       return PRED_KERNELS(name##_f64);      \
   }
 
-// The same for tables by storage type: name_f32, name_f64, name_bf16 or name_f16 (math/half.h).
+// The same for tables by storage type (math/half.h): name_f32, name_f64, name_bf16 or name_f16.
 #define PRED_KERNELS_BY_STORAGE(Table, name)        \
   template <typename S>                             \
   const Table<S>& kernels() {                       \

@@ -10,6 +10,14 @@ import torch
 from torch import Tensor
 
 FLOATING = (torch.float32, torch.float64)
+HALF = (torch.bfloat16, torch.float16)
+
+
+def check_tensors(op: str, **arguments: object) -> None:
+    """Each must be a tensor."""
+    for name, value in arguments.items():
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{op}: {name} must be a tensor, got {type(value).__name__}")
 
 
 def check_shape(op: str, name: str, tensor: Tensor, shape: Sequence[int | str], where: str = "") -> None:
@@ -40,8 +48,18 @@ def check_like(op: str, name: str, tensor: Tensor, other_name: str, other: Tenso
 
 def widen(tensor: Tensor) -> Tensor:
     """In a half-precision (autocast) region: the tensor in float32 if it is narrower."""
-    half = tensor.dtype in (torch.bfloat16, torch.float16)
-    return tensor.float() if half and torch.is_autocast_enabled(tensor.device.type) else tensor
+    return tensor.float() if tensor.dtype in HALF and torch.is_autocast_enabled(tensor.device.type) else tensor
+
+
+def as_geometry(tensor: Tensor) -> Tensor:
+    """In float32 if it is narrower: positions, distances and weights are too coarse in half precision."""
+    return tensor.float() if tensor.dtype in HALF else tensor
+
+
+def check_features(op: str, name: str, features: Tensor, other_name: str, geometry: Tensor) -> None:
+    """``features`` must have the device and dtype of ``geometry``, or be half precision beside float32."""
+    half = features.dtype in HALF and geometry.dtype == torch.float32
+    check_like(op, name, features.new_empty(0, dtype=torch.float32) if half else features, other_name, geometry)
 
 
 def check_choice(op: str, name: str, value: str, choices: Sequence[str]) -> None:

@@ -9,9 +9,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pred.ops._check import FLOATING, check_choice, check_dtype, check_like, check_offsets, check_shape, widen
-
-HALF = (torch.bfloat16, torch.float16)
+from pred.ops._check import (
+    FLOATING,
+    as_geometry,
+    check_choice,
+    check_dtype,
+    check_features,
+    check_like,
+    check_offsets,
+    check_shape,
+    check_tensors,
+    widen,
+)
 
 
 class Composite(NamedTuple):
@@ -28,7 +37,7 @@ def geometry(tensor: Tensor, packed: bool) -> Tensor:
     dims = 1 if packed else 2
     if tensor.dim() == dims + 1 and tensor.shape[-1] == 1:
         tensor = tensor[..., 0]
-    return tensor.float() if tensor.dtype in HALF else tensor
+    return as_geometry(tensor)
 
 
 def composite_arguments(
@@ -43,6 +52,8 @@ def composite_arguments(
     """Checked ``source`` (called ``name``), ``t`` and ``values``, with shapes and dtypes as the kernels take them."""
     check_choice(op, "depth_at", depth_at, ("start", "mid"))
     packed = ray_offsets is not None
+    optional = {"t": t, "values": values, "ray_offsets": ray_offsets}
+    check_tensors(op, **{name: source}, **{key: value for key, value in optional.items() if value is not None})
     source = geometry(source, packed)
     check_shape(op, name, source, ("P",) if packed else ("R", "S"))
     check_dtype(op, name, source, FLOATING)
@@ -50,17 +61,12 @@ def composite_arguments(
         check_offsets(op, "ray_offsets", ray_offsets, "RP", name, source)
     if t is not None:
         t = geometry(t, packed)
-        if t.shape != source.shape:  # or the sizes in the text would be constants of a compiled graph
-            sizes = f"P={source.shape[0]}" if packed else f"R={source.shape[0]} and S={source.shape[1]}"
-            check_shape(op, "t", t, source.shape, f" as {name}, with {sizes}")
+        check_shape(op, "t", t, source.shape, f" as {name}")  # without its sizes: a compiled graph would depend on them
         check_like(op, "t", t, name, source)
     if values is not None:
         values = widen(values)
         check_shape(op, "values", values, (*source.shape, "C"))
-        if values.dtype in HALF and source.dtype == torch.float32:
-            check_like(op, "values", values.new_empty(0, dtype=source.dtype), name, source)  # the device
-        else:
-            check_like(op, "values", values, name, source)
+        check_features(op, "values", values, name, source)
     return source, t, values
 
 

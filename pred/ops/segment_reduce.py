@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, check_choice, check_dtype, check_shape, widen
+from pred.ops._check import FLOATING, check_choice, check_dtype, check_shape, check_tensors, widen
 
 
 def segment_reduce(
@@ -68,6 +68,7 @@ def segment_reduce_reference(
 
 def _arguments(features: Tensor, index: Tensor, num_segments: int, reduce: str) -> Tensor:
     op = "segment_reduce"
+    check_tensors(op, features=features, index=index)
     features = widen(features)
     check_shape(op, "features", features, ("N", "C"))
     check_shape(op, "index", index, (features.shape[0],), " as features")

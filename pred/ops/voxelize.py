@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, check_dtype, check_shape
+from pred.ops._check import FLOATING, check_dtype, check_shape, check_tensors
 
 _MAX_KEYS = 2**62
 _MAX_CELLS = 2**30
@@ -56,6 +56,7 @@ def voxelize(
 
     Not differentiable: the outputs are integers. Equal bits for any thread count and instruction set.
     """
+    check_tensors("voxelize", points=points, batch_offsets=batch_offsets)
     if points.dim() != 2 or points.shape[1] < 3:
         raise ValueError(f"voxelize: points must have shape [N, D] with D >= 3, got {list(points.shape)}")
     check_dtype("voxelize", "points", points, FLOATING)
