@@ -328,6 +328,10 @@ def _resample_rays_cases(sizes: Sizes) -> list[Case]:
 
 
 def _eager_resample(t: Tensor, weights: Tensor, added: int) -> Tensor:
+    return torch.cat([t, _eager_samples(t, weights, added)], dim=1).sort(dim=1).values
+
+
+def _eager_samples(t: Tensor, weights: Tensor, added: int) -> Tensor:
     mass = weights[:, :-1]
     total = mass.sum(dim=1, keepdim=True)
     mass = torch.where(total > 0, mass, t[:, 1:] - t[:, :-1])
@@ -338,13 +342,93 @@ def _eager_resample(t: Tensor, weights: Tensor, added: int) -> Tensor:
     before = after - 1
     low, high = cdf.gather(1, before), cdf.gather(1, after)
     start, end = t.gather(1, before), t.gather(1, after)
-    samples = torch.lerp(start, end, (u - low) / (high - low))
-    return torch.cat([t, samples], dim=1).sort(dim=1).values
+    return torch.lerp(start, end, (u - low) / (high - low))
+
+
+def _section_cases(sizes: Sizes) -> list[Case]:
+    """NeuS's opacities: distances at the middles of sections that the rays meet at an angle."""
+    sdf, inv_s, t, _ = cases.ray_samples(sizes)
+    rays, samples = sdf.shape
+    length = F.pad(t.diff(dim=1), (0, 1), value=0.1)
+    cosine = 1.6 * torch.rand(sdf.shape, generator=torch.Generator().manual_seed(0)) - 1.3
+    plane = sdf.nbytes
+
+    def case(name: str, eps: float, eager: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]) -> Case:
+        def call(function: Callable[..., Tensor], *inputs: Tensor) -> tuple[Tensor]:
+            sdf, inv_s, cosine, length = inputs
+            return (function(sdf, inv_s, "section", cosine=cosine, section_length=length, cos_anneal=0.5, eps=eps),)
+
+        return Case(
+            op="sdf_to_alpha",
+            name=f"sdf_to_alpha {rays}x{samples}, {name}",
+            unit="rays",
+            items=rays,
+            inputs=(sdf, inv_s, cosine, length),
+            ours=lambda *inputs: call(ops.sdf_to_alpha, *inputs),
+            reference=lambda *inputs: call(reference.sdf_to_alpha, *inputs),
+            eager={name: Variant(lambda *inputs: (eager(*inputs),))},
+            compiled=(name,),
+            derivative_in=(0, 2),
+            phases=(Phase(FORWARD, "4 (4 RS)", 4 * plane), Phase(BACKWARD, "4 (10 RS)", 10 * plane)),
+        )
+
+    return [case("section", 0.0, _eager_section), case("section as published", 1e-5, _eager_section_published)]
+
+
+def _eager_fall(cosine: Tensor, length: Tensor) -> Tensor:
+    return (F.relu(0.5 - 0.5 * cosine) * 0.5 + F.relu(-cosine) * 0.5) * length
+
+
+def _eager_section(sdf: Tensor, inv_s: Tensor, cosine: Tensor, length: Tensor) -> Tensor:
+    fall = _eager_fall(cosine, length)
+    return torch.sigmoid(-inv_s * (sdf - 0.5 * fall)) * -torch.expm1(-inv_s * fall)
+
+
+def _eager_section_published(sdf: Tensor, inv_s: Tensor, cosine: Tensor, length: Tensor) -> Tensor:
+    half = 0.5 * _eager_fall(cosine, length)
+    before, after = torch.sigmoid((sdf + half) * inv_s), torch.sigmoid((sdf - half) * inv_s)
+    return ((before - after + 1e-5) / (before + 1e-5)).clip(0, 1)
+
+
+def _sample_pdf_cases(sizes: Sizes) -> list[Case]:
+    t, weights = cases.coarse_rays(sizes)
+    rays, edges, added = *t.shape, sizes.fine_samples
+
+    def case(mode: str, eager: Callable[[Tensor, Tensor, int], Tensor]) -> Case:
+        return Case(
+            op="sample_pdf",
+            name=f"sample_pdf {rays}x{edges} -> {added}, {mode}",
+            unit="rays",
+            items=rays,
+            inputs=(t, weights),
+            ours=lambda t, weights: (ops.sample_pdf(t, weights, added, mode=mode),),
+            reference=lambda t, weights: (reference.sample_pdf(t, weights, added, mode=mode),),
+            eager={"searchsorted": Variant(lambda t, weights: (eager(t, weights, added),))},
+            compiled=("searchsorted",),
+            # Where the distribution is flat, a sample jumps across the gap if the sum is rounded differently.
+            outliers=1e-2 if mode == "neus" else 1e-4,
+            phases=(Phase(FORWARD, "4 R (2 S + n)", t.nbytes + weights.nbytes + 4 * rays * added),),
+        )
+
+    return [case("exact", _eager_samples), case("neus", _eager_samples_neus)]
+
+
+def _eager_samples_neus(t: Tensor, weights: Tensor, added: int) -> Tensor:
+    mass = weights[:, :-1] + 1e-5
+    cdf = F.pad((mass / mass.sum(dim=1, keepdim=True)).cumsum(dim=1), (1, 0))
+    u = ((torch.arange(added, dtype=t.dtype) + 0.5) / added).expand(t.shape[0], -1).contiguous()
+    index = torch.searchsorted(cdf, u, right=True)
+    before, after = (index - 1).clamp_min(0), index.clamp_max(t.shape[1] - 1)
+    low = cdf.gather(1, before)
+    width = cdf.gather(1, after) - low
+    start = t.gather(1, before)
+    return start + (u - low) / torch.where(width < 1e-5, 1, width) * (t.gather(1, after) - start)
 
 
 CASES: dict[str, Callable[[Sizes], list[Case]]] = {
-    "sdf_to_alpha": _sdf_to_alpha_cases,
+    "sdf_to_alpha": lambda sizes: [*_sdf_to_alpha_cases(sizes), *_section_cases(sizes)],
     "composite_alpha": _composite_alpha_cases,
     "composite_rays": _composite_rays_cases,
     "resample_rays": _resample_rays_cases,
+    "sample_pdf": _sample_pdf_cases,
 }
