@@ -2,17 +2,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """The plain PyTorch references of all ops, under the ops' own names."""
 
+from pred.ops.composite_alpha import composite_alpha_reference as composite_alpha
 from pred.ops.composite_rays import composite_rays_reference as composite_rays
 from pred.ops.resample_rays import resample_rays_reference as resample_rays
 from pred.ops.sample_bev import sample_bev_reference as sample_bev
+from pred.ops.sample_bev import sample_bev_with_grad_reference as sample_bev_with_grad
+from pred.ops.sample_pdf import sample_pdf_reference as sample_pdf
+from pred.ops.sample_volume import sample_volume_reference as sample_volume
+from pred.ops.sample_volume import sample_volume_with_grad_reference as sample_volume_with_grad
 from pred.ops.sdf_to_alpha import sdf_to_alpha_reference as sdf_to_alpha
 from pred.ops.segment_reduce import segment_reduce_reference as segment_reduce
 from pred.ops.voxelize import voxelize_reference as voxelize
 
 __all__ = [
+    "composite_alpha",
     "composite_rays",
     "resample_rays",
     "sample_bev",
+    "sample_bev_with_grad",
+    "sample_pdf",
+    "sample_volume",
+    "sample_volume_with_grad",
     "sdf_to_alpha",
     "segment_reduce",
     "voxelize",
