@@ -159,7 +159,9 @@ def test_half_storage(backend: str, example: Example, dtype: torch.dtype) -> Non
     leaves, order = example.leaves(arguments), min(order_of(example), 1)
     actual = evaluate(example.native, arguments, leaves, order)
     expected = evaluate(example.reference, widened(arguments), leaves, order)
+    same_dtypes = evaluate(example.reference, arguments, leaves, order)
     for name, value in actual.items():
+        assert value.dtype == same_dtypes[name].dtype, name
         leaf = arguments.get(name.removeprefix("grad_"))
         if name.startswith("grad_") and isinstance(leaf, Tensor):
             assert value.dtype == leaf.dtype, name
