@@ -142,11 +142,7 @@ def evaluate(
     targets = {name: value for name, value in out.items() if value.requires_grad}
     if order == 0 or not targets:
         return found
-    cotangents = {
-        # float32 values in every dtype, so that all dtypes compute the same thing
-        name: torch.linspace(-1, 2, value.numel()).reshape(value.shape).to(value.dtype).requires_grad_(order > 1)
-        for name, value in targets.items()
-    }
+    cotangents = {name: steps(value).requires_grad_(order > 1) for name, value in targets.items()}
     # Where an output does not depend on an argument, torch says None; here, and in what follows, that is 0.
     first = grads(list(targets.values()), list(held.values()), list(cotangents.values()), create_graph=order > 1)
     found |= {f"grad_{name}": grad.detach() for name, grad in zip(held, first, strict=True)}
@@ -156,6 +152,11 @@ def evaluate(
         second = grads([grad.square().sum() for grad in curved], list(inputs.values()))
         found |= {f"second_{name}": grad for name, grad in zip(inputs, second, strict=True)}
     return found
+
+
+def steps(like: Tensor) -> Tensor:
+    """-1 to 2 in multiples of 1/64, which every dtype holds, so that all dtypes compute the same thing."""
+    return (torch.linspace(-64, 128, like.numel()).round() / 64).reshape(like.shape).to(like.dtype)
 
 
 def grads(
