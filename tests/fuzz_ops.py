@@ -15,15 +15,14 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import os
-import queue
 import random
 import resource
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import traceback
 import warnings
@@ -40,7 +39,7 @@ from pred import _native
 from tests.ops.examples import EXAMPLES, Example, Source, outputs, recorded_calls
 
 SEEDS_PER_RUN = 10**9
-SECONDS_PER_CALL = 60.0
+SECONDS_PER_CALL = 60
 EXTRA_MEMORY = 6 << 30
 ACCEPTED = (ValueError, TypeError, RuntimeError)
 DTYPES = [
@@ -255,8 +254,8 @@ def attempt(function: Callable[[], Any]) -> tuple[Any, Exception | None]:
 
 
 def rule(error: Exception) -> str:
-    """The text without the fact: C++ prints fewer digits."""
-    return str(error).partition(", got")[0]
+    """The text without the fact, of which C++ prints fewer digits, and with True as C++ has it."""
+    return str(error).partition(", got")[0].replace("=True", "=1").replace("=False", "=0")
 
 
 def shapes(result: dict[str, Tensor]) -> dict[str, Any]:
@@ -389,110 +388,89 @@ def child(first: int, last: int) -> None:
     limit_memory()
     for seed in range(first, last):
         print("call", seed, flush=True)
+        signal.alarm(SECONDS_PER_CALL)  # ends the process, wherever it is
         try:
             print("done", fuzzer.run(seed), flush=True)
         except FindingError as finding:
-            print("finding", seed, repr(str(finding)), flush=True)
+            print("finding", json.dumps(str(finding)), flush=True)
 
 
 class Run:
-    """The parent: starts children, and one more where one ends."""
+    """The parent: starts a child, and another one where that ends."""
 
     def __init__(self, seed: int, findings_path: str | None) -> None:
-        self.first = seed * SEEDS_PER_RUN
-        self.next = self.first
+        self.first = self.next = seed * SEEDS_PER_RUN
         self.counts: Counter[str] = Counter()
         self.findings: dict[int, str] = {}
         self.path = findings_path
+        self.started = self.shown = time.monotonic()
 
-    def add(self, seed: int, text: str) -> None:
-        self.findings[seed] = text
-        shown = f"FINDING {seed}: {text}\n  again: python -m tests.fuzz_ops --only {seed}\n"
+    def until(self, end: float, calls: int | None) -> None:
+        last = self.first + (SEEDS_PER_RUN if calls is None else calls)
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+        while self.next < last and time.monotonic() < end:
+            with tempfile.TemporaryFile("w+") as stderr:
+                process = subprocess.Popen(
+                    [sys.executable, "-m", "tests.fuzz_ops", "--child", str(self.next), str(last)],
+                    stdout=subprocess.PIPE,
+                    stderr=stderr,
+                    env=environment,
+                    cwd=os.sep,  # `-m` puts the working folder first on the path
+                    text=True,
+                )
+                assert process.stdout is not None
+                began = False
+                for line in process.stdout:
+                    word, _, rest = line.rstrip("\n").partition(" ")
+                    began = True
+                    if word == "done":
+                        self.counts[rest] += 1
+                    elif word == "finding":
+                        self.add(json.loads(rest))
+                    if word != "call":
+                        self.next += 1
+                    self.show(end, calls)
+                    if time.monotonic() >= end:
+                        process.kill()
+                code = process.wait()
+                if code != 0 and time.monotonic() < end:
+                    stderr.seek(0)
+                    tail = stderr.read()[-6000:]
+                    if not began:
+                        raise SystemExit(f"the child did not start (exit status {code}):\n{tail}")
+                    name = signal.Signals(-code).name if code < 0 else f"exit status {code}"
+                    late = f", which ends a call after {SECONDS_PER_CALL} s" if name == "SIGALRM" else ""
+                    self.add(f"the process died ({name}{late})\n{tail}")
+                    self.next += 1
+
+    def add(self, text: str) -> None:
+        """A finding of the present call."""
+        self.findings[self.next] = text
+        shown = f"FINDING {self.next}: {text}\n  again: python -m tests.fuzz_ops --only {self.next}\n"
         print(shown, flush=True)
         if self.path:
             with open(self.path, "a") as file:
                 file.write(shown + "\n")
 
-    def until(self, end: float, calls: int | None) -> None:
-        last = self.first + (SEEDS_PER_RUN if calls is None else calls)
-        started = shown = time.monotonic()
-        while self.next < last and time.monotonic() < end:
-            with tempfile.TemporaryFile("w+") as stderr:
-                process, lines = start(self.next, last, stderr)
-                current: int | None = None
-                while True:
-                    now = time.monotonic()
-                    if now >= end:
-                        process.kill()
-                        break
-                    if now - shown > 10:
-                        shown = now
-                        rate = (self.next - self.first) / (now - started)
-                        share = (self.next - self.first) / (last - self.first) if calls else 1.0
-                        left = (now - started) * (1 / max(share, 1e-9) - 1) if calls else end - now
-                        print(
-                            f"{self.next - self.first} calls, {rate:.0f} a second, {len(self.findings)} findings, "
-                            f"{left / 60:.1f} min left",
-                            flush=True,
-                        )
-                    try:
-                        line = lines.get(timeout=min(SECONDS_PER_CALL, max(end - now, 0.01)))
-                    except queue.Empty:
-                        if time.monotonic() < end:
-                            process.kill()
-                            self.add(self.next, f"no answer within {SECONDS_PER_CALL:.0f} s")
-                            self.next += 1
-                        break
-                    if line is None:
-                        break
-                    word, _, rest = line.rstrip("\n").partition(" ")
-                    if word == "call":
-                        current = self.next = int(rest)
-                    elif word == "done":
-                        self.counts[rest] += 1
-                        current, self.next = None, self.next + 1
-                    elif word == "finding":
-                        self.add(self.next, str(eval(rest.partition(" ")[2])))  # the repr() of a str
-                        current, self.next = None, self.next + 1
-                code = process.wait()
-                if time.monotonic() < end and code != 0 and self.next not in self.findings and self.next < last:
-                    stderr.seek(0)
-                    tail = stderr.read()[-6000:]
-                    if current is None:
-                        raise SystemExit(f"the child did not start (exit status {code}):\n{tail}")
-                    name = signal.Signals(-code).name if code < 0 else f"exit status {code}"
-                    self.add(current, f"the process died ({name})\n{tail}")
-                    self.next += 1
+    def show(self, end: float, calls: int | None) -> None:
+        """Progress, every ten seconds."""
+        now = time.monotonic()
+        if now - self.shown < 10:
+            return
+        self.shown = now
+        made = self.next - self.first
+        left = end - now
+        if calls is not None:
+            left = min(left, (now - self.started) / max(made, 1) * (calls - made))
+        print(
+            f"{made} calls, {made / (now - self.started):.0f} a second, {len(self.findings)} findings, "
+            f"{left / 60:.1f} min left",
+            flush=True,
+        )
 
     def summary(self) -> str:
         outcome = ", ".join(f"{count} {name}" for name, count in self.counts.most_common())
         return f"{sum(self.counts.values()) + len(self.findings)} calls: {outcome}; {len(self.findings)} findings"
-
-
-def start(first: int, last: int, stderr: Any) -> tuple[subprocess.Popen[str], queue.Queue[str | None]]:
-    """A child with the parent's module path, wherever it lies, and a queue of its lines."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
-    with tempfile.TemporaryDirectory() as folder:  # `-m` puts the working folder first on the path
-        process = subprocess.Popen(
-            [sys.executable, "-m", "tests.fuzz_ops", "--child", str(first), str(last)],
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-            env=environment,
-            cwd=folder,
-            text=True,
-        )
-        lines: queue.Queue[str | None] = queue.Queue()
-
-        def read() -> None:
-            assert process.stdout is not None
-            for line in process.stdout:
-                lines.put(line)
-            lines.put(None)
-
-        threading.Thread(target=read, daemon=True).start()
-        # The folder must last until the child has begun.
-        lines.put(lines.get())
-    return process, lines
 
 
 def main() -> int:
@@ -512,6 +490,7 @@ def main() -> int:
         print(f"nothing to fuzz: {status['reason']}", file=sys.stderr)
         return 2
     if options.only is not None:
+        signal.alarm(5 * SECONDS_PER_CALL)
         warnings.simplefilter("ignore")
         fuzzer = Fuzzer()
         limit_memory()

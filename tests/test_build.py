@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,47 @@ import torch
 ROOT = Path(__file__).resolve().parents[1]
 X86_LINUX = sys.platform == "linux" and platform.machine() == "x86_64"
 LEVELS = ("default", "avx2", "avx512", "avx512_bf16") if X86_LINUX else ("default",)
+
+# Instructions that a first x86-64 processor lacks: AVX and later (all begin with v), SSE3 to SSE4.2, bit manipulation.
+# tzcnt is left out: compilers write the old bsf with a prefix that makes it tzcnt on new processors.
+BEYOND_BASELINE = re.compile(
+    r"(?!verr|verw)v.*|p?blend.*|round[ps][sd]|p(max|min)(sb|sd|ud|uw)|pmul(dq|ld|hrsw)|pmov[sz]x.*|pshufb|palignr|ptest"
+    r"|pabs[bwd]|psign[bwd]|ph(add|sub).*|h(add|sub)p[sd]|addsubp[sd]|mov(ddup|shdup|sldup|be)|lddqu|dpp[sd]|pcmp(eq|gt)q"
+    r"|p(ext|ins)r[bdq]|(insert|extract)ps|packusdw|pmaddubsw|mpsadbw|pcmp[ei]str.*|crc32.*|popcnt.*|lzcnt.*|andn[lq]?"
+    r"|bextr.*|bls(i|r|msk).*|bzhi.*|mulx.*|pdep.*|pext|rorx.*|sa[lr]x.*|sh[lr]x.*"
+)
+BEYOND_AVX2 = re.compile(r"%zmm|%k[0-7]\b|%[xy]mm(1[6-9]|2\d|3[01])\b|\{1to\d+\}")
+BEYOND_AVX512 = re.compile(r"bf16|v4fmadd|vp2intersect|fp16|%tmm")
+
+
+def too_wide(level: str, mnemonic: str, operands: str) -> bool:
+    """Whether an instruction needs more than the level promises."""
+    if level == "default":
+        return BEYOND_BASELINE.fullmatch(mnemonic) is not None or re.search(r"%[yz]mm\d", operands) is not None
+    if level == "avx2":
+        return BEYOND_AVX2.search(operands) is not None
+    return level == "avx512" and BEYOND_AVX512.search(mnemonic) is not None
+
+
+def instructions(path: Path) -> Iterator[tuple[str, str, str]]:
+    """Function, mnemonic and operands, for all code in an object or library."""
+    function = ""
+    for line in run("objdump", "-d", "--no-show-raw-insn", str(path)).stdout.splitlines():
+        if line.endswith(">:"):
+            function = line.partition("<")[2][:-2]
+        elif "\t" in line:
+            words = line.split("\t", 1)[1].split(None, 1)
+            while words and words[0] in ("lock", "rep", "repz", "repnz", "notrack", "bnd", "data16", "cs"):
+                words = words[1].split(None, 1) if len(words) > 1 else []
+            if words:
+                yield function, words[0], words[1] if len(words) > 1 else ""
+
+
+def level_of(symbol: str) -> str | None:
+    """The level of a mangled name, None of code outside of the kernels."""
+    found = re.search(r"\disa_(default|avx512_bf16|avx512|avx2)", symbol)
+    return found[1] if found else None
+
 
 pytestmark = pytest.mark.skipif(
     not (ROOT / "setup.py").exists() or shutil.which("cmake") is None or shutil.which("ninja") is None,
@@ -61,26 +103,47 @@ def test_undefined_symbols_are_stable(build: Path) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads ELF files")
 @pytest.mark.parametrize("level", LEVELS)
-def test_kernel_objects_export_nothing_that_could_be_merged(build: Path, level: str) -> None:
+def test_kernel_objects_share_nothing_that_could_be_merged(build: Path, level: str) -> None:
+    """Of one function that several levels define, the linker would keep any: a wide one, say. And nothing of a wide
+    level may run before the level is chosen."""
     objects = list((build / f"CMakeFiles/kernels_{level}.dir").rglob("*.o"))
-    assert objects
+    assert {path.name for path in objects} == {f"{path.name}.o" for path in (ROOT / "csrc/ops").glob("*_cpu.cpp")}
     for path in objects:
         for line in run("nm", "-C", str(path)).stdout.splitlines():
             kind, name = line[17:18], line[19:]
-            assert kind not in "VvWwu", f"{path.name} exports the weak symbol {name}"
-            if kind in "TDRB":
+            assert kind not in "VvWwuC", f"{path.name} exports the weak symbol {name}"
+            if kind in "TDRBSG":
                 assert name.startswith(f"pred::isa_{level}::"), f"{path.name} exports {name}"
+            if kind == "U":  # C functions such as memcpy; no C++ runtime, no torch
+                allowed = re.fullmatch(r"[a-z][a-z0-9]*|__stack_chk_fail|_GLOBAL_OFFSET_TABLE_|__(asan|ubsan)\w*", name)
+                assert allowed, f"{path.name} needs {name}"
+        sections = run("readelf", "-SW", str(path)).stdout
+        assert not re.search(r"\.(init_array|ctors|init)\b", sections), f"{path.name} runs code when it is loaded"
 
 
 @pytest.mark.skipif(not X86_LINUX, reason="other processors have one level")
-def test_baseline_objects_use_no_wide_registers(build: Path) -> None:
-    folders = ("kernels_default", "pred_cpu")
-    objects = [path for name in folders for path in (build / f"CMakeFiles/{name}.dir").rglob("*.o")]
-    assert objects
-    for path in objects:
-        assert not re.search(r"%[yz]mm\d", run("objdump", "-d", str(path)).stdout), path
-    wide = build / "CMakeFiles/kernels_avx512.dir/csrc/ops/sample_bev_cpu.cpp.o"
-    assert "%zmm" in run("objdump", "-d", str(wide)).stdout  # the check above can see them
+@pytest.mark.parametrize("level", LEVELS)
+def test_kernel_objects_keep_to_their_instruction_set(build: Path, level: str) -> None:
+    for path in (build / f"CMakeFiles/kernels_{level}.dir").rglob("*.o"):
+        wrong = [code for code in instructions(path) if too_wide(level, *code[1:])]
+        assert not wrong, f"{path.name}: {wrong[:3]}"
+
+
+@pytest.mark.skipif(not X86_LINUX, reason="other processors have one level")
+def test_library_reaches_no_wide_instruction_but_through_its_tables(build: Path) -> None:
+    """In the linked library: each function keeps to its level, code outside of the kernels to the baseline; no level
+    calls a function of another one, and none is called by name."""
+    seen = set()
+    for function, mnemonic, operands in instructions(build / "libpred_cpu.so"):
+        level = level_of(function)
+        assert not too_wide(level or "default", mnemonic, operands), f"{function}: {mnemonic} {operands}"
+        if "%zmm" in operands or "%ymm" in operands:
+            seen.add(level)
+        if mnemonic.startswith(("call", "j")) and "<" in operands:
+            target = operands.partition("<")[2]
+            assert level_of(target) in (None, level), f"{function} calls {target}"
+            assert level is None or level_of(target) == level or "@plt" in target, f"{function} calls {target}"
+    assert seen == {"avx2", "avx512", "avx512_bf16"}  # the check can see them
 
 
 def test_wheel_serves_every_python(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ struct SampleGrid {
       }
       args.border = border;
       args.align_corners = align_corners;
-      zeros.reset(new S[args.channels]());
+      zeros.reset(new S[map.numel() > 0 ? args.channels : 0]());
       args.zeros = zeros.get();
     }
 
@@ -232,6 +232,7 @@ struct SampleGrid {
     constexpr int64_t kBandRows = 8;
     const auto& a = in.args;
     const auto& k = Op::template table<S>();
+    if (in.map.numel() == 0) return new_channels_last(in.map);  // whatever its other sizes are
     SampleGridOrder order{nullptr, bits_for(in.num_samples()), {}};
     int cell_bits = 0;
     for (int axis = 0; axis < kAxes; ++axis) {

@@ -88,7 +88,9 @@ class Example:
     """Whether torch.compile makes one graph of the reference."""
 
     def __str__(self) -> str:
-        return "-".join([self.op, *(f"{name}={value}" for name, value in self.options.items())])
+        kind = self.build.__name__.strip("_")
+        named = [] if kind == self.op.removesuffix("_with_grad") else [kind]
+        return "-".join([self.op, *named, *(f"{name}={value}" for name, value in self.options.items())])
 
     def arguments(self, source: Source, dtype: torch.dtype) -> Arguments:
         """Arguments with geometry in ``dtype`` (float32 at least) and features in ``dtype``."""
@@ -140,11 +142,7 @@ def evaluate(
     targets = {name: value for name, value in out.items() if value.requires_grad}
     if order == 0 or not targets:
         return found
-    cotangents = {
-        # float32 values in every dtype, so that all dtypes compute the same thing
-        name: torch.linspace(-1, 2, value.numel()).reshape(value.shape).to(value.dtype).requires_grad_(order > 1)
-        for name, value in targets.items()
-    }
+    cotangents = {name: steps(value).requires_grad_(order > 1) for name, value in targets.items()}
     # Where an output does not depend on an argument, torch says None; here, and in what follows, that is 0.
     first = grads(list(targets.values()), list(held.values()), list(cotangents.values()), create_graph=order > 1)
     found |= {f"grad_{name}": grad.detach() for name, grad in zip(held, first, strict=True)}
@@ -154,6 +152,11 @@ def evaluate(
         second = grads([grad.square().sum() for grad in curved], list(inputs.values()))
         found |= {f"second_{name}": grad for name, grad in zip(inputs, second, strict=True)}
     return found
+
+
+def steps(like: Tensor) -> Tensor:
+    """-1 to 2 in multiples of 1/64, which every dtype holds, so that all dtypes compute the same thing."""
+    return (torch.linspace(-64, 128, like.numel()).round() / 64).reshape(like.shape).to(like.dtype)
 
 
 def grads(
@@ -177,6 +180,15 @@ def _sample_bev(source: Source) -> Arguments:
     }
 
 
+def _sample_volume(source: Source) -> Arguments:
+    batch, channels = source.size(2, 0, 3), source.size(5, 0, 70)
+    sizes = (source.size(4, 1, 9), source.size(7, 1, 20), source.size(6, 1, 20))
+    return {
+        "volume": source.normal(batch, channels, *sizes),
+        "grid": source.dyadic(-1.3, 1.3, batch, source.count, 3),
+    }
+
+
 def _segment_reduce(source: Source) -> Arguments:
     segments = source.size(50, 1, 90)
     return {
@@ -187,9 +199,8 @@ def _segment_reduce(source: Source) -> Arguments:
 
 
 def _voxelize(source: Source) -> Arguments:
-    points = source.uniform(-5, 45, source.count, source.size(4, 3, 6))
     return {
-        "points": points,
+        "points": source.uniform(-5, 45, source.count, source.size(4, 3, 6)),
         "batch_offsets": source.offsets(source.count, source.size(3, 1, 5)),
         "voxel_size": (0.5, 0.25, 8.0),
         "point_range": (0.0, 0.0, 0.0, 40.0, 40.0, 40.0),
@@ -200,59 +211,147 @@ def _rays(source: Source) -> Arguments:
     """Rays through soft surfaces, some of which they leave again."""
     rays, samples = source.count, source.size(33, 0, 70)
     t = source.uniform(0, 1, rays, samples).cumsum(dim=1) + 1
-    surface = source.uniform(2, 12, rays, 1)
-    sdf = surface - 0.8 * t + 0.4 * source.normal(rays, samples)
+    sdf = source.uniform(2, 12, rays, 1) - 0.8 * t + 0.4 * source.normal(rays, samples)
     return {"sdf": sdf, "inv_s": source.uniform(1, 5, 1)[0], "t": t}
 
 
-def _sdf_to_alpha(source: Source) -> Arguments:
+def _packed_rays(source: Source) -> Arguments:
+    """The same with any number of samples on each."""
+    total = source.count * source.size(9, 0, 30) if source.count else 0
+    t = source.uniform(1, 12, total).sort().values
+    sdf = 5 - 0.8 * t + 0.4 * source.normal(total)
+    return {
+        "sdf": sdf,
+        "inv_s": source.uniform(1, 5, 1)[0],
+        "t": t,
+        "ray_offsets": source.offsets(total, source.count),
+    }
+
+
+def _pair(source: Source) -> Arguments:
     rays = _rays(source)
     return {"sdf": rays["sdf"], "inv_s": rays["inv_s"]}
 
 
-def _composite_rays(source: Source) -> Arguments:
+def _packed_pair(source: Source) -> Arguments:
+    rays = _packed_rays(source)
+    del rays["t"]
+    return rays
+
+
+def _section(source: Source) -> Arguments:
     rays = _rays(source)
-    return rays | {"values": source.normal(*rays["sdf"].shape, source.size(4, 0, 40))}
+    shape = rays["sdf"].shape
+    return {
+        "sdf": rays["sdf"],
+        "inv_s": rays["inv_s"],
+        "cosine": source.uniform(-1, 0.9, *shape),
+        "section_length": source.uniform(0.1, 1, *shape),
+    }
+
+
+def _density(source: Source) -> Arguments:
+    shape = source.count, source.size(33, 0, 70)
+    return {"sdf": source.uniform(0, 3, *shape), "section_length": source.uniform(0.1, 1, *shape)}
+
+
+def _with_values(rays: Arguments, source: Source) -> Arguments:
+    return rays | {"values": source.normal(*rays["t"].shape, source.size(4, 0, 40))}
+
+
+def _composite_rays(source: Source) -> Arguments:
+    return _with_values(_rays(source), source)
+
+
+def _packed_composite_rays(source: Source) -> Arguments:
+    return _with_values(_packed_rays(source), source)
+
+
+def _alphas(rays: Arguments, source: Source) -> Arguments:
+    """Opacities in [0, 1], some of them exactly 0 or 1."""
+    alpha = (source.uniform(-0.2, 1.02, *rays.pop("sdf").shape).clamp(0, 1.01) ** 3).clamp(0, 1)
+    del rays["inv_s"]
+    return _with_values(rays | {"alpha": alpha}, source)
+
+
+def _composite_alpha(source: Source) -> Arguments:
+    return _alphas(_rays(source), source)
+
+
+def _packed_composite_alpha(source: Source) -> Arguments:
+    return _alphas(_packed_rays(source), source)
+
+
+def _distribution(source: Source, name: str) -> Arguments:
+    samples, new = source.size(24, 2, 70), source.size(17, 0, 70)
+    return {
+        name: source.uniform(0.1, 1, source.count, samples).cumsum(dim=1) + 1,
+        # No section is nearly empty: in one, a rounding of u moves the sample by 1e-7 / weight.
+        "weights": source.uniform(0.2, 1, source.count, samples),
+        "num_samples": new,
+        "u": source.uniform(0, 1, source.count, new),
+    }
+
+
+def _sample_pdf(source: Source) -> Arguments:
+    return _distribution(source, "edges")
 
 
 def _resample_rays(source: Source) -> Arguments:
-    samples, new = source.size(24, 2, 70), source.size(17, 0, 70)
-    t = source.uniform(0.1, 1, source.count, samples).cumsum(dim=1) + 1
-    # No section is nearly empty: in one, a rounding of u moves the sample by 1e-7 / weight.
-    weights = source.uniform(0.2, 1, source.count, samples)
-    return {"t": t, "weights": weights, "num_samples": new, "u": source.uniform(0, 1, source.count, new)}
+    return _distribution(source, "t")
 
 
 def _examples(op: str, build: Callable[[Source], Arguments], *options: Arguments, **fields: Any) -> list[Example]:
     return [Example(op, build, chosen, **fields) for chosen in options or ({},)]
 
 
+_PADDINGS = [
+    {"padding_mode": mode, "align_corners": corners} for mode in ("zeros", "border") for corners in (False, True)
+]
+# Positions are rounded to float32 before they are scaled to cells: 1e-7 of the map's width.
+_BEV: dict[str, Any] = {"differentiable": ("bev", "grid"), "features": ("bev",), "tolerance": 4}
+_VOLUME: dict[str, Any] = {"differentiable": ("volume", "grid"), "features": ("volume",), "tolerance": 4}
+# Up to 70 opacities are multiplied along a ray.
+_RAYS: dict[str, Any] = {
+    "differentiable": ("sdf", "alpha", "inv_s", "t", "values"),
+    "features": ("values",),
+    "tolerance": 3,
+}
+# A rounding of the cumulative distribution moves a sample by 1e-7 / weight along its section.
+_PDF: dict[str, Any] = {"order": 0, "tolerance": 20}
+
 EXAMPLES = [
-    *_examples(
-        "sample_bev",
-        _sample_bev,
-        *(
-            {"padding_mode": mode, "align_corners": corners}
-            for mode in ("zeros", "border")
-            for corners in (False, True)
-        ),
-        differentiable=("bev", "grid"),
-        order=2,
-        # Positions are rounded to float32 before they are scaled to cells: 1e-7 of the map's width.
-        tolerance=4,
-    ),
+    *_examples("sample_bev", _sample_bev, *_PADDINGS, order=2, **_BEV),
+    *_examples("sample_bev_with_grad", _sample_bev, *_PADDINGS, **_BEV),
+    *_examples("sample_volume", _sample_volume, *_PADDINGS, order=2, **_VOLUME),
+    *_examples("sample_volume_with_grad", _sample_volume, *_PADDINGS, **_VOLUME),
     *_examples(
         "segment_reduce",
         _segment_reduce,
         *({"reduce": reduce} for reduce in ("sum", "mean", "max")),
         differentiable=("features",),
         order=None,
-        # A sum of n rows carries the rounding of n additions.
-        tolerance=4,
+        tolerance=4,  # a sum of n rows carries the rounding of n additions
         many=20000,
     ),
     *_examples("voxelize", _voxelize, order=0, many=70000, reference_compiles=False),
-    *_examples("sdf_to_alpha", _sdf_to_alpha, {}, {"last": "opaque"}, {"inv_s": 2.7}, differentiable=("sdf", "inv_s")),
+    *_examples("sdf_to_alpha", _pair, {}, {"last": "opaque"}, {"inv_s": 2.7}, differentiable=("sdf", "inv_s")),
+    *_examples(
+        "sdf_to_alpha",
+        _packed_pair,
+        {},
+        {"last": "opaque"},
+        differentiable=("sdf", "inv_s"),
+        reference_compiles=False,
+    ),
+    *_examples(
+        "sdf_to_alpha",
+        _section,
+        {"mode": "section"},
+        {"mode": "section", "eps": 1e-5, "cos_anneal": 0.3},
+        differentiable=("sdf", "inv_s", "cosine", "section_length"),
+    ),
+    *_examples("sdf_to_alpha", _density, {"mode": "density", "inv_s": None}, differentiable=("sdf", "section_length")),
     *_examples(
         "composite_rays",
         _composite_rays,
@@ -261,19 +360,39 @@ EXAMPLES = [
         {"values": None},
         {"detach_sdf": True},
         {"detach_sdf": True, "detach_inv_s": False},
-        differentiable=("sdf", "inv_s", "t", "values"),
-        # Up to 70 samples are multiplied along a ray.
-        tolerance=3,
+        **_RAYS,
     ),
     *_examples(
-        "resample_rays",
-        _resample_rays,
+        "composite_rays",
+        _packed_composite_rays,
         {},
-        {"u": None},
-        order=0,
-        # A rounding of the cumulative distribution moves a sample by 1e-7 / weight along its section.
-        tolerance=20,
+        {"depth_at": "mid", "last": "opaque"},
+        {"values": None, "detach_sdf": True},
+        reference_compiles=False,
+        **_RAYS,
     ),
+    *_examples(
+        "composite_alpha",
+        _composite_alpha,
+        {},
+        {"depth_at": "mid", "transmittance_eps": 1e-7, "normalize_depth": True},
+        {"values": None},
+        {"t": None},
+        {"t": None, "values": None},
+        **_RAYS,
+    ),
+    *_examples(
+        "composite_alpha",
+        _packed_composite_alpha,
+        {},
+        {"depth_at": "mid", "transmittance_eps": 1e-7},
+        reference_compiles=False,
+        **_RAYS,
+    ),
+    *_examples("sample_pdf", _sample_pdf, *({"mode": mode} for mode in ("exact", "neus", "nerfstudio")), **_PDF),
+    *_examples("sample_pdf", _sample_pdf, {"u": None}, {"num_samples": None}, **_PDF),
+    *_examples("resample_rays", _resample_rays, *({"mode": mode} for mode in ("exact", "neus", "nerfstudio")), **_PDF),
+    *_examples("resample_rays", _resample_rays, {"u": None}, **_PDF),
 ]
 
 
