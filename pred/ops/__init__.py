@@ -7,20 +7,31 @@ Dimensions: ``B`` batch, ``N`` points or samples, ``M`` voxels, ``R`` rays, ``S`
 module, which is its fallback and its oracle; :mod:`pred.ops.reference` gathers them.
 """
 
+from pred.ops.ball_query import Ball, ball_query
 from pred.ops.composite_rays import Composite, composite_rays
+from pred.ops.farthest_point_sample import farthest_point_sample
+from pred.ops.knn import Neighbors, knn
 from pred.ops.resample_rays import resample_rays
 from pred.ops.sample_bev import sample_bev
 from pred.ops.sdf_to_alpha import sdf_to_alpha
 from pred.ops.segment_reduce import segment_reduce
 from pred.ops.voxelize import Voxels, voxelize
+from pred.ops.voxelize_hard import HardVoxels, voxelize_hard
 
 __all__ = [
+    "Ball",
     "Composite",
+    "HardVoxels",
+    "Neighbors",
     "Voxels",
+    "ball_query",
     "composite_rays",
+    "farthest_point_sample",
+    "knn",
     "resample_rays",
     "sample_bev",
     "sdf_to_alpha",
     "segment_reduce",
     "voxelize",
+    "voxelize_hard",
 ]
