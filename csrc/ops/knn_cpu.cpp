@@ -2,9 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // One iteration owns one query and its row of the outputs.
-#include "ops/knn.h"
-
 #include "math/heap.h"
+#include "ops/knn.h"
 
 namespace pred::PRED_ISA {
 namespace {
