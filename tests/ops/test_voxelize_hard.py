@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import pytest
 import torch
 from torch import Tensor
+from torch._dynamo.testing import CompileCounterWithBackend
 
 from benchmarks.cases import POINT_RANGE_M, lidar_points
 from pred.ops import HardVoxels, reference, voxelize_hard
@@ -246,14 +247,14 @@ def test_compiles_to_one_graph(native: None, monkeypatch: pytest.MonkeyPatch) ->
         found = voxelize_hard(points, offsets, SIZES[1], RANGE, 4, 50)
         return found.voxels.sum(dim=1) / found.counts[:, None]
 
-    counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
+    counter = CompileCounterWithBackend("aot_eager")
     compiled = torch.compile(mean_per_voxel, fullgraph=True, backend=counter)
     for num_points in (40, 90, 55, 300, 77):
         points, offsets = cloud(num_points).requires_grad_(), torch.tensor([0, 10, num_points])
         actual, expected = compiled(points, offsets), mean_per_voxel(points, offsets)
         assert torch.equal(actual, expected)
-        slopes = [torch.autograd.grad(out.square().sum(), points)[0] for out in (actual, expected)]
-        assert_close(*slopes, 1e-6)
+        slope, expected_slope = (torch.autograd.grad(out.square().sum(), points)[0] for out in (actual, expected))
+        assert_close(slope, expected_slope, 1e-6)
     assert counter.frame_count <= 2
 
 
