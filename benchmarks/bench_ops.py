@@ -1,9 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""The ops: ours against good plain PyTorch, eager and compiled.
-
-Three phases are timed: ``forward`` without autograd; ``forward+backward``; ``second order``, which is forward, the
-first derivative in the grid as a differentiable result, and the backward pass through both, as an Eikonal term needs.
+"""The ops: ours against good plain PyTorch, eager and compiled, and against peers.
 
 Each phase states the least traffic it could have: every input read once and every output written once per pass.
 """
@@ -13,19 +10,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from benchmarks import cases, ops_points, ops_rays, ops_sampling
-from benchmarks.case import BACKWARD, FORWARD, SECOND, Case, Phase, Variant
+from benchmarks.case import SECOND_ALONE, Case, Phase, Variant
 from benchmarks.cases import Sizes
-from benchmarks.measure import time_interleaved
-from benchmarks.report import Row
+from benchmarks.measure import Run, time_interleaved
+from benchmarks.memory import added_peak_bytes
+from benchmarks.phases import prepare, prepare_compiled
+from benchmarks.report import NOT_INSTALLED, Row
 from pred._native import native_status
 
-CASES = ops_sampling.CASES | ops_rays.CASES | ops_points.CASES
+FAMILIES = {"sampling": ops_sampling.CASES, "rays": ops_rays.CASES, "points": ops_points.CASES}
+CASES = {op: make for family in FAMILIES.values() for op, make in family.items()}
 
 
 def make_cases(op: str, sizes: Sizes) -> list[Case]:
@@ -38,7 +37,7 @@ def make_cases(op: str, sizes: Sizes) -> list[Case]:
 
 def expected_results(case: Case, phase: Phase) -> list[Tensor]:
     """What the reference gives: outputs, then gradients."""
-    return _prepare(case, phase, Variant(case.reference))()
+    return prepare(case, phase, Variant(case.reference))()
 
 
 def run_phase(
@@ -51,23 +50,50 @@ def run_phase(
     rounds: int,
     on_step: Callable[[str], None],
 ) -> list[Row]:
-    """Checks every contender of a phase against the reference, then times those that are right, interleaved.
+    """Checks the contenders of a phase; those that are right are timed, interleaved, and then called once more to see
+    what memory they take.
+
+    Args:
+        case, phase, expected, threads, kinds: see `check_phase`.
+        min_time_s, rounds: see `time_interleaved`.
+        on_step: told what happens next, once per contender and once before timing.
+    """
+    rows, runs = check_phase(case, phase, expected, threads, kinds, on_step)
+    on_step(f"{case.name}, {phase.name}, {threads} threads: timing")
+    for name, timing in time_interleaved(runs, threads, min_time_s, rounds).items():
+        rows[name].timing = timing
+    for name, run in runs.items():
+        rows[name].peak_memory_bytes = added_peak_bytes(run.ready())
+    return list(rows.values())
+
+
+def check_phase(
+    case: Case,
+    phase: Phase,
+    expected: list[Tensor],
+    threads: int,
+    kinds: Sequence[str],
+    on_step: Callable[[str], None],
+) -> tuple[dict[str, Row], dict[str, Run]]:
+    """Compares every contender of a phase with the reference.
 
     Args:
         case, phase: what to run.
         expected: from `expected_results`.
         threads: torch's threads, for compiling too (compiled code keeps their number).
-        kinds: which of `KINDS` take part.
-        min_time_s, rounds: see `time_interleaved`.
-        on_step: told what happens next, once per contender and once before timing.
+        kinds: which of `KINDS`, and "reference", take part.
+        on_step: told what happens next, once per contender.
+
+    Returns:
+        A row per contender, without times, and what those that are right run; both by name.
     """
     torch.set_num_threads(threads)
     if "compiled" in kinds:
         torch._dynamo.reset()  # or a second shape of the same function would be compiled for dynamic shapes
     label = f"{case.name}, {phase.name}, {threads} threads"
     rows: dict[str, Row] = {}
-    runs: dict[str, Callable[[], list[Tensor]]] = {}
-    for kind, name, variant in _contenders(case, kinds):
+    runs: dict[str, Run] = {}
+    for kind, name, make_variant in _contenders(case, phase, kinds):
         on_step(f"{label}: {name}")
         row = rows[name] = Row(
             op=case.op,
@@ -86,99 +112,50 @@ def run_phase(
             row.status = f"missing: {reason}"
             continue
         try:
-            run = (_prepare_compiled if kind == "compiled" else _prepare)(case, phase, variant)
-            actual = run()
-        except Exception as error:  # a compiler may refuse in any way; the run goes on
+            variant = make_variant()
+        except ImportError:
+            row.status = NOT_INSTALLED
+            continue
+        try:
+            run = (prepare_compiled if kind == "compiled" else prepare)(case, phase, variant)
+            actual = run() if variant.as_ours is None else variant.as_ours(run())
+        except Exception as error:  # a compiler or a peer may refuse in any way; the run goes on
             row.status = f"refused: {first_line(error)}"
             continue
         row.error, wrong = _compare(actual, expected, case)
+        del actual
         if wrong:
             row.status = f"wrong: {wrong}"
         else:
             runs[name] = run
-    on_step(f"{label}: timing")
-    for name, timing in time_interleaved(runs, threads, min_time_s, rounds).items():
-        rows[name].timing = timing
-    return list(rows.values())
+    return rows, runs
 
 
-def _contenders(case: Case, kinds: Sequence[str]) -> list[tuple[str, str, Variant]]:
-    """Kind, name and variant."""
-    found: list[tuple[str, str, Variant]] = []
+def _contenders(case: Case, phase: Phase, kinds: Sequence[str]) -> list[tuple[str, str, Callable[[], Variant]]]:
+    """Kind, name, and what gives the variant."""
+
+    def known(variant: Variant) -> Callable[[], Variant]:
+        return lambda: variant
+
+    found: list[tuple[str, str, Callable[[], Variant]]] = []
     if "ours" in kinds:
-        found.append(("ours", "ours", Variant(case.ours)))
+        found.append(("ours", "ours", known(Variant(case.ours))))
+    if "reference" in kinds:
+        found.append(("reference", "reference", known(Variant(case.reference))))
     if "eager" in kinds:
-        found += [("eager", f"eager {name}", variant) for name, variant in case.eager.items()]
-    if "compiled" in kinds:
-        found += [("compiled", f"compiled {name}", case.eager[name]) for name in case.compiled]
+        found += [("eager", f"eager {name}", known(variant)) for name, variant in case.eager.items()]
+    if "compiled" in kinds and phase.name != SECOND_ALONE:
+        found += [("compiled", f"compiled {name}", known(case.eager[name])) for name in case.compiled]
+    if "peers" in kinds:
+        found += [("peer", name, make_variant) for name, make_variant in case.peers.items()]
     return found
-
-
-def compiled(function: Callable[..., Any]) -> Any:
-    """``torch.compile`` for fixed shapes; from torch 2.13 on, `function` may call ``autograd.grad``."""
-    if hasattr(torch._dynamo.config, "trace_autograd_ops"):
-        torch._dynamo.config.trace_autograd_ops = True
-    return torch.compile(function, dynamic=False)
-
-
-def _prepare_compiled(case: Case, phase: Phase, variant: Variant) -> Callable[[], list[Tensor]]:
-    """As `_prepare`; what is differentiated twice can only be compiled as a whole."""
-    if phase.name == SECOND:
-        run: Callable[[], list[Tensor]] = compiled(_prepare(case, phase, variant))
-        return run
-    return _prepare(case, phase, Variant(compiled(variant.function), variant.inputs))
-
-
-def _prepare(case: Case, phase: Phase, variant: Variant) -> Callable[[], list[Tensor]]:
-    """One call of a phase, on the variant's own leaves and incoming gradients; returns all results."""
-    function = variant.function
-    inputs = [
-        tensor.detach().requires_grad_(position in case.derivative_in and phase.name != FORWARD)
-        for position, tensor in enumerate(case.inputs if variant.inputs is None else variant.inputs)
-    ]
-    if phase.name == FORWARD:
-
-        def forward() -> list[Tensor]:
-            with torch.no_grad():
-                return list(function(*inputs))
-
-        return forward
-
-    leaves = [inputs[position] for position in case.derivative_in]
-    probe = function(*inputs)
-    grads = [_incoming(probe[position], seed) for seed, position in enumerate(case.derivative_of)]
-    if phase.name == BACKWARD:
-
-        def backward() -> list[Tensor]:
-            outputs = function(*inputs)
-            used = [outputs[position] for position in case.derivative_of]
-            return [*(out.detach() for out in outputs), *torch.autograd.grad(used, leaves, grads)]
-
-        return backward
-
-    # sample_bev only: output 0, map and grid
-    grid = inputs[1]
-    cotangent = _incoming(probe[0], len(grads)).requires_grad_()
-    grad_grad = _incoming(grid, len(grads) + 1)
-
-    def second() -> list[Tensor]:
-        (out,) = function(*inputs)
-        (slope,) = torch.autograd.grad(out, grid, cotangent, create_graph=True)
-        results = torch.autograd.grad([out, slope], [*leaves, cotangent], [grads[0], grad_grad])
-        return [out.detach(), slope.detach(), *results]
-
-    return second
-
-
-def _incoming(like: Tensor, seed: int) -> Tensor:
-    """The same random gradient for every contender, in the memory layout of its own output."""
-    values = torch.randn(like.shape, generator=torch.Generator().manual_seed(seed), dtype=like.dtype)
-    return torch.empty_like(like).copy_(values)
 
 
 def _compare(actual: list[Tensor], expected: list[Tensor], case: Case) -> tuple[float, str]:
     """Largest relative error, and what is wrong (nothing: empty)."""
     worst, wrong = 0.0, ""
+    if len(actual) != len(expected):
+        return math.inf, f"{len(actual)} results, not {len(expected)}"
     for number, (have, want) in enumerate(zip(actual, expected, strict=True)):
         if have.shape != want.shape:
             return math.inf, f"result {number} has shape {list(have.shape)}, not {list(want.shape)}"

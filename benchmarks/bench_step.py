@@ -23,22 +23,22 @@ its own, because the peak of resident memory is a process's.
 
 from __future__ import annotations
 
+import json
 import os
-import resource
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from benchmarks import cases
-from benchmarks.bench_ops import compiled, first_line, missing_kernel
-from benchmarks.case import KINDS
+from benchmarks.bench_ops import first_line, missing_kernel
 from benchmarks.cases import SIZES, Sizes
 from benchmarks.measure import current_allocator, enter_allocator, time_interleaved
+from benchmarks.memory import added_peak_bytes
+from benchmarks.phases import compiled
 from benchmarks.report import Row, Target
 from pred.losses import LossConfig, depth_loss, eikonal_loss, semantic_loss
 from pred.models.field import FieldConfig, FieldDecoder, FieldOutput
@@ -47,6 +47,7 @@ from pred.models.renderer import Renderer, RendererConfig, Sharpness
 LOSS_TOLERANCE = 1e-4
 GRADIENT_TOLERANCE = 1e-3
 ROUNDS = 3
+CONTENDERS = ("ours", "eager", "compiled")
 
 Run = Callable[[], list[Tensor]]
 
@@ -176,7 +177,7 @@ def run_step(
     Args:
         sizes_name: key of `cases.SIZES`.
         threads: torch's threads.
-        kinds: which of `bench_ops.KINDS` take part; ``reference`` always does.
+        kinds: which of `CONTENDERS` take part; ``reference`` always does.
         min_time_s: see `time_interleaved`; a step of real size takes one call per round.
         on_step: told what happens next.
     """
@@ -187,7 +188,7 @@ def run_step(
     rows: dict[str, Row] = {}
     runs: dict[str, Run] = {}
     expected: list[Tensor] = []
-    for name in ("reference", *(kind for kind in KINDS if kind in kinds)):
+    for name in ("reference", *(kind for kind in CONTENDERS if kind in kinds)):
         on_step(f"step, {threads} threads: {name}")
         row = rows[name] = _row(name, sizes, threads)
         if name == "ours" and (reason := missing_kernel("composite_rays")):
@@ -253,33 +254,12 @@ def _add_memory(row: Row, sizes_name: str) -> None:
     command = [sys.executable, "-m", "benchmarks.bench_step", row.contender, sizes_name, str(row.threads)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
     if done.returncode == 0:
-        row.peak_memory_bytes = int(done.stdout)
+        row.peak_memory_bytes = json.loads(done.stdout)
     else:
         row.status = f"ok; its memory is unknown: the process that measures it ended with {done.returncode}"
-
-
-def added_memory(run: Callable[[], object]) -> int:
-    """Peak resident memory during a call beyond what was resident before, bytes."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew from here
-        before = _status_bytes("VmRSS")
-        run()
-        return _status_bytes("VmHWM") - before
-    except OSError:  # no such file system, or not allowed: the peak of the start-up may hide some of the step's
-        unit = 1 if sys.platform == "darwin" else 1024
-        before = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        run()
-        return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-
-
-def _status_bytes(name: str) -> int:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(name + ":"):
-            return 1024 * int(line.split()[1])
-    raise OSError(f"/proc/self/status holds no {name}")
 
 
 if __name__ == "__main__":
     enter_allocator(current_allocator() or "raised")
     torch.set_num_threads(int(sys.argv[3]))
-    print(added_memory(contender(sys.argv[1], SIZES[sys.argv[2]])))
+    print(json.dumps(added_peak_bytes(contender(sys.argv[1], SIZES[sys.argv[2]]))))

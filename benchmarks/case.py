@@ -4,15 +4,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
 from benchmarks.report import Target
 
 FORWARD, BACKWARD, SECOND = "forward", "forward+backward", "second order"
-KINDS = ("ours", "eager", "compiled")
+"""Phases that cases declare."""
+BACKWARD_ALONE, SECOND_ALONE = "backward", "second backward"
+"""Phases that follow from them: the last pass of `BACKWARD` and of `SECOND`, its graph built outside the time."""
+KINDS = ("ours", "eager", "compiled", "peers")
 
 Function = Callable[..., tuple[Tensor, ...]]
 
@@ -35,6 +38,8 @@ class Variant:
     function: Function
     inputs: tuple[Tensor, ...] | None = None
     """Inputs in this variant's best memory format; None: the case's own."""
+    as_ours: Callable[[list[Tensor]], list[Tensor]] | None = None
+    """Brings its results into the form of ours for the check, outside the time; None: they have it."""
 
 
 @dataclass(frozen=True)
@@ -62,3 +67,5 @@ class Case:
     """Of every result, relative to its largest magnitude; 0: equal."""
     outliers: float = 0.0
     """Share of elements that may miss the tolerance, with the reason beside it."""
+    peers: Mapping[str, Callable[[], Variant]] = field(default_factory=dict)
+    """Other libraries, by name. The call imports the library, so that a missing one is an ImportError of its own."""

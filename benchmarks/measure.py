@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.utils.benchmark import Timer
 
 import pred
@@ -71,10 +72,31 @@ class Timing:
     round_medians_s: list[float]
     """One per round; the contenders' rounds alternate, so that equal positions saw the same disturbances."""
     page_faults_per_call: float
+    busy_cores: float | None = None
+    """Processor time over wall time: near 1 for a peer that runs in one thread whatever torch is set to."""
 
     def record(self) -> dict[str, Any]:
         """For the JSON file."""
         return asdict(self)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One contender's work in a phase."""
+
+    call: Callable[..., list[Tensor]]
+    """What is timed; returns all results."""
+    before: Callable[[], Any] | None = None
+    """Runs ahead of each call, outside its time; `call` takes what it returns."""
+
+    def __call__(self) -> list[Tensor]:
+        """All of it."""
+        return self.ready()()
+
+    def ready(self) -> Callable[[], list[Tensor]]:
+        """The timed part, for one call."""
+        prepared = () if self.before is None else (self.before(),)
+        return lambda: self.call(*prepared)
 
 
 def time_interleaved(
@@ -86,7 +108,7 @@ def time_interleaved(
     """Times callables in turn, round after round.
 
     Args:
-        contenders: what to call, by name; each was called before.
+        contenders: what to call, by name; each was called before. Of a `Run` only its `call` is timed.
         threads: torch's threads during the measurement.
         min_time_s: time spent on each contender, over all rounds. A slow one takes one call per round, and sits out the
             rounds after the third if it is far beyond its time.
@@ -109,9 +131,13 @@ class _Block:
 
     call_s: list[float]
     page_faults_per_call: float
+    busy_cores: float
 
 
 def _time_block(run: Callable[[], object], threads: int, min_time_s: float) -> _Block:
+    torch.set_num_threads(threads)
+    if isinstance(run, Run) and run.before is not None:
+        return _time_prepared_block(run.before, run.call, min_time_s)
     calls = 0
 
     def counted() -> None:
@@ -120,14 +146,32 @@ def _time_block(run: Callable[[], object], threads: int, min_time_s: float) -> _
         run()
 
     faults = _page_faults()
-    torch.set_num_threads(threads)
-    start_time = time.perf_counter()
+    processor_time, start_time = time.process_time(), time.perf_counter()
     counted()
     call_s = [time.perf_counter() - start_time]
     if call_s[0] < SLOW_CALL_S:  # otherwise that was the measurement: warm caches mean little to so long a call
         timer = Timer("run()", globals={"run": counted}, num_threads=threads)
         call_s = timer.blocked_autorange(min_run_time=min_time_s).times
-    return _Block(call_s, (_page_faults() - faults) / calls)
+    busy_cores = (time.process_time() - processor_time) / (time.perf_counter() - start_time)
+    return _Block(call_s, (_page_faults() - faults) / calls, busy_cores)
+
+
+def _time_prepared_block(before: Callable[[], Any], call: Callable[..., object], min_time_s: float) -> _Block:
+    """Call by call, as `before` must not count; the clock's own 0.1 us does."""
+    call_s: list[float] = []
+    faults, processor_s, total_s = 0, 0.0, 0.0
+    while total_s < min_time_s:
+        prepared = before()
+        faults -= _page_faults()
+        processor_time, start_time = time.process_time(), time.perf_counter()
+        call(prepared)
+        call_s.append(time.perf_counter() - start_time)
+        processor_s += time.process_time() - processor_time
+        faults += _page_faults()
+        total_s += call_s[-1]
+        if call_s[-1] >= SLOW_CALL_S:
+            break
+    return _Block(call_s, faults / len(call_s), processor_s / total_s)
 
 
 def _join(blocks: list[_Block]) -> Timing:
@@ -140,6 +184,7 @@ def _join(blocks: list[_Block]) -> Timing:
         len(call_s),
         [statistics.median(block.call_s) for block in blocks],
         statistics.median(block.page_faults_per_call for block in blocks),
+        statistics.median(block.busy_cores for block in blocks),
     )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from benchmarks import cases
+from benchmarks import cases, peers
 from benchmarks.case import BACKWARD, FORWARD, Case, Phase, Variant
 from benchmarks.cases import Sizes
 from benchmarks.report import Target
@@ -106,6 +106,7 @@ def _segment_reduce_cases(sizes: Sizes) -> list[Case]:
                 if not (reduce == "max" and name == "index_add")
             },
             compiled=("scatter_reduce",),
+            peers=peers.segment_reduce(segments, reduce),
             derivative_in=(0,),
             phases=(
                 Phase(FORWARD, "4 NC + 8 N + 4 MC", rows + index.nbytes + out),

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from benchmarks import cases
+from benchmarks import cases, peers
 from benchmarks.case import BACKWARD, FORWARD, Case, Phase, Variant
 from benchmarks.cases import Sizes
 from benchmarks.report import Target
@@ -64,6 +64,7 @@ def _composite_rays_cases(sizes: Sizes) -> list[Case]:
             reference=plain,
             eager=variants,
             compiled=tuple(variants),
+            peers=peers.composite(_padded_alpha),
             derivative_in=(0,),
             derivative_of=(1,),
             phases=(
@@ -81,6 +82,7 @@ def _composite_rays_cases(sizes: Sizes) -> list[Case]:
             reference=plain,
             eager=variants,
             compiled=tuple(variants),
+            peers=peers.composite(_padded_alpha),
             derivative_in=(0, 3),
             derivative_of=(1, 3),
             phases=(
@@ -99,6 +101,10 @@ def _composite_rays_cases(sizes: Sizes) -> list[Case]:
 def _eager_alpha(sdf: Tensor, inv_s: Tensor) -> Tensor:  # [R, S - 1]
     here, after = sdf[:, :-1], sdf[:, 1:]
     return torch.sigmoid(-inv_s * after) * -torch.expm1(-inv_s * F.relu(here - after))
+
+
+def _padded_alpha(sdf: Tensor, inv_s: Tensor) -> Tensor:  # [R, S]
+    return F.pad(_eager_alpha(sdf, inv_s), (0, 1))
 
 
 def _eager_composite_cumprod(sdf: Tensor, inv_s: Tensor, t: Tensor, values: Tensor | None = None) -> tuple[Tensor, ...]:

@@ -1,6 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a run found: rows, their comparison with each other and with the machine's ceilings, and the printed tables."""
+"""What a run found: rows, their comparison with each other and with the machine's ceilings, and the tables of both."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from typing import Any, Literal
 from benchmarks.measure import Ceilings, Timing
 
 SCHEMA = 1
+NOT_INSTALLED = "not installed"
+MEASURED_MEMORY_BYTES = 1e6
+"""Peaks below are not compared: pages and the allocator's own needs are too large a part of them."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +21,7 @@ class Target:
     """What a phase should reach: so many times the speed of a contender, a share of a ceiling, or a part of the memory
     (4: a quarter)."""
 
-    against: Literal["eager", "compiled", "copy bandwidth", "matrix rate", "eager's memory"]
+    against: Literal["eager", "compiled", "peer", "copy bandwidth", "matrix rate", "eager's memory"]
     at_least: float
 
 
@@ -32,7 +35,7 @@ class Row:
     threads: int
     contender: str
     kind: str
-    """``ours``, ``eager``, ``compiled``, or ``reference``."""
+    """``ours``, ``eager``, ``compiled``, ``peer``, or ``reference``."""
     unit: str
     items: int
     """Number of `unit`s in one call."""
@@ -43,12 +46,12 @@ class Row:
     """Formula of the useful arithmetic, where matrix products are the limit."""
     flop: int = 0
     status: str = "ok"
-    """``ok``, or why there is no time: ``refused: ...``, ``missing: ...``, ``wrong: ...``."""
+    """``ok``, or why there is no time: ``refused: ...``, ``missing: ...``, ``wrong: ...``, ``not installed``."""
     error: float | None = None
     """Largest difference to the reference, relative to the largest magnitude of each result."""
     timing: Timing | None = None
     peak_memory_bytes: int | None = None
-    """Added to what the process held before."""
+    """Of one call, beyond what the process held before it (see `benchmarks.memory`)."""
     targets: tuple[Target, ...] = ()
 
     def record(self, ceilings: Mapping[int, Ceilings]) -> dict[str, Any]:
@@ -84,7 +87,7 @@ def compare(rows: Sequence[Row], ceilings: Mapping[int, Ceilings]) -> list[dict[
         timed = [row for row in group if row.timing is not None]
         best = {
             kind: min((row for row in timed if row.kind == kind), key=_median, default=None)
-            for kind in ("ours", "reference", "eager", "compiled")
+            for kind in ("ours", "reference", "eager", "compiled", "peer")
         }
         ours = best.pop("ours")
         comparison: dict[str, Any] = {"op": group[0].op, "case": case, "phase": phase, "threads": threads}
@@ -98,8 +101,11 @@ def compare(rows: Sequence[Row], ceilings: Mapping[int, Ceilings]) -> list[dict[
             if key in rates
         }
         eager = best["eager"]
-        if ours and eager and ours.peak_memory_bytes and eager.peak_memory_bytes:
+        comparison["memory"] = None
+        if ours and eager and ours.peak_memory_bytes and (eager.peak_memory_bytes or 0) >= MEASURED_MEMORY_BYTES:
+            assert eager.peak_memory_bytes is not None
             reached["eager's memory"] = eager.peak_memory_bytes / ours.peak_memory_bytes
+            comparison["memory"] = {"contender": eager.contender, "share": 1 / reached["eager's memory"]}
         comparison["targets"] = [
             asdict(target)
             | {
@@ -131,12 +137,53 @@ def _speedup(ours: Row, other: Row) -> dict[str, Any]:
     }
 
 
-def format_rows(rows: Sequence[Row], ceilings: Mapping[int, Ceilings]) -> str:
-    """The table of contenders."""
-    header = ["case", "phase", "threads", "contender", "ms", "IQR ms", "rate", "GB/s", "of ceiling", "peak MB", ""]
+@dataclass(frozen=True)
+class Table:
+    """Text in columns; those without content are left out."""
+
+    header: tuple[str, ...]
+    lines: list[list[str]]
+    right: tuple[int, ...] = ()
+    """Columns aligned to the right."""
+
+    def text(self) -> str:
+        """Aligned by spaces."""
+        columns = self._columns()
+        widths = {column: max(len(line[column]) for line in [self.header, *self.lines]) for column in columns}
+
+        def aligned(line: Sequence[str]) -> str:
+            cells = (
+                line[column].rjust(widths[column]) if column in self.right else line[column].ljust(widths[column])
+                for column in columns
+            )
+            return "  ".join(cells).rstrip()
+
+        rule = "  ".join("-" * widths[column] for column in columns)
+        return "\n".join([aligned(self.header), rule, *(aligned(line) for line in self.lines)])
+
+    def markdown(self) -> str:
+        """As GitHub shows it."""
+        columns = self._columns()
+
+        def joined(cells: Sequence[str]) -> str:
+            return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+        rule = joined(["---:" if column in self.right else "---" for column in columns])
+        lines = (joined([line[column] for column in columns]) for line in [self.header, *self.lines])
+        return "\n".join([next(lines), rule, *lines])
+
+    def _columns(self) -> list[int]:
+        return [column for column in range(len(self.header)) if any(line[column] for line in self.lines)]
+
+
+def row_table(rows: Sequence[Row], ceilings: Mapping[int, Ceilings]) -> Table:
+    """The table of contenders, without peers that are not there."""
+    header = ("case", "phase", "threads", "contender", "ms", "IQR ms", "rate", "GB/s", "of ceiling", "peak MB", "")
     lines = []
     previous = ""
     for row in rows:
+        if row.status == NOT_INSTALLED:
+            continue
         shown = "" if row.case == previous else row.case
         previous = row.case
         line = [shown, row.phase, str(row.threads), row.contender]
@@ -149,6 +196,9 @@ def format_rows(rows: Sequence[Row], ceilings: Mapping[int, Ceilings]) -> str:
             ceiling = f"{rates['copy_share']:.0%} copy"
         elif "matrix_share" in rates:
             ceiling = f"{rates['matrix_share']:.0%} matrix"
+        note = "" if row.status == "ok" else row.status
+        if row.kind == "peer" and row.timing.busy_cores is not None:
+            note = f"{row.timing.busy_cores:.1f} cores busy"
         lines.append(
             [
                 *line,
@@ -157,66 +207,63 @@ def format_rows(rows: Sequence[Row], ceilings: Mapping[int, Ceilings]) -> str:
                 f"{_short(rates['items_per_s'])} {row.unit}/s",
                 f"{rates['bytes_per_s'] / 1e9:.2f}" if "bytes_per_s" in rates else "",
                 ceiling,
-                f"{row.peak_memory_bytes / 1e6:.0f}" if row.peak_memory_bytes is not None else "",
-                "" if row.status == "ok" else row.status,
+                f"{row.peak_memory_bytes / 1e6:.1f}" if row.peak_memory_bytes is not None else "",
+                note,
             ]
         )
-    return format_table(header, lines, right=(2, 4, 5, 6, 7, 8, 9))
+    return Table(header, lines, right=(2, 4, 5, 6, 7, 8, 9))
 
 
-def format_comparisons(
+def missing_peers(rows: Sequence[Row]) -> list[str]:
+    """Names of the peers that are not installed."""
+    return sorted({row.contender for row in rows if row.status == NOT_INSTALLED})
+
+
+def comparison_table(
     comparisons: Sequence[Mapping[str, Any]], default_allocator: Sequence[Mapping[str, Any]] = ()
-) -> str:
+) -> Table:
     """The table of ratios and targets, with the default allocator's ratio beside."""
-    others = {_key(comparison): comparison for comparison in default_allocator}
-    header = ["case", "phase", "threads", "vs eager", "rounds", "vs compiled", "default malloc: vs eager", "target"]
+    others = {key_of(comparison): comparison for comparison in default_allocator}
+    header = (
+        *("case", "phase", "threads", "vs reference", "vs eager", "rounds", "vs compiled", "vs peer", "memory"),
+        *("default malloc: vs eager", "target"),
+    )
     lines = []
     previous = ""
     for comparison in comparisons:
         shown = "" if comparison["case"] == previous else comparison["case"]
         previous = comparison["case"]
-        eager = comparison["speedup"].get("eager")
+        against = comparison["speedup"].get("eager") or comparison["speedup"].get("reference")
+        memory, peer = comparison.get("memory"), comparison["speedup"].get("peer")
         lines.append(
             [
                 shown,
                 comparison["phase"],
                 str(comparison["threads"]),
+                _ratio(comparison, "reference"),
                 _ratio(comparison, "eager"),
-                f"{eager['lowest_round']:.1f} to {eager['highest_round']:.1f}" if eager else "",
+                f"{against['lowest_round']:.1f} to {against['highest_round']:.1f}" if against else "",
                 _ratio(comparison, "compiled"),
-                _ratio(others.get(_key(comparison), {"speedup": {}}), "eager"),
+                f"{_ratio(comparison, 'peer')} {peer['contender']}" if peer else "",
+                f"{memory['share']:.2f}x eager" if memory else "",
+                _ratio(others.get(key_of(comparison), {"speedup": {}}), "eager"),
                 "; ".join(_verdict(target) for target in comparison["targets"]),
             ]
         )
-    return format_table(header, lines, right=(2, 3, 4, 5, 6))
+    return Table(header, lines, right=(2, 3, 4, 5, 6, 7, 8, 9))
 
 
-def format_ceilings(ceilings: Mapping[int, Ceilings]) -> str:
+def ceiling_table(ceilings: Mapping[int, Ceilings]) -> Table:
     """The measured ceilings."""
     lines = [
         [str(threads), f"{item.copy_bytes_per_s / 1e9:.1f} GB/s", f"{item.matrix_flop_per_s / 1e9:.1f} GFLOP/s"]
         for threads, item in ceilings.items()
     ]
-    return format_table(["threads", "copy bandwidth", "matrix rate"], lines, right=(0, 1, 2))
+    return Table(("threads", "copy bandwidth", "matrix rate"), lines, right=(0, 1, 2))
 
 
-def format_table(header: Sequence[str], lines: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
-    """Columns aligned by spaces, those in ``right`` to the right; columns without content are left out."""
-    columns = [column for column in range(len(header)) if any(line[column] for line in lines)]
-    widths = {column: max(len(line[column]) for line in [header, *lines]) for column in columns}
-
-    def aligned(line: Sequence[str]) -> str:
-        cells = (
-            line[column].rjust(widths[column]) if column in right else line[column].ljust(widths[column])
-            for column in columns
-        )
-        return "  ".join(cells).rstrip()
-
-    rule = "  ".join("-" * widths[column] for column in columns)
-    return "\n".join([aligned(header), rule, *(aligned(line) for line in lines)])
-
-
-def _key(comparison: Mapping[str, Any]) -> tuple[str, str, int]:
+def key_of(comparison: Mapping[str, Any]) -> tuple[str, str, int]:
+    """Case, phase and threads: what a comparison is of."""
     return comparison["case"], comparison["phase"], comparison["threads"]
 
 

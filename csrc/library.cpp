@@ -1,7 +1,7 @@
 // Copyright 2026 The PRED authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Every op schema. Sizes: B batch, C channels, H W rows and columns of a BEV map, N points or samples.
+// Every op schema. Sizes: B batch, C channels, D H W layers, rows and columns of a map, N points or samples.
 // Implementations register in ops/<op>.cpp; fake kernels and derivatives in pred/ops/<op>.py.
 #include <torch/csrc/stable/library.h>
 
@@ -17,6 +17,7 @@ STABLE_TORCH_LIBRARY(pred, m) {
   // Test hook of common/parallel.h: throws in a worker when fail_at >= 0.
   m.def("parallel_probe(Tensor out, int grain, int fail_at) -> ()");
 
+  // The second output of *_with_grad is the derivative in the grid, [B, N, 2 or 3, C].
   m.def("sample_bev(Tensor bev, Tensor grid, bool border, bool align_corners) -> Tensor");
   m.def(
       "sample_bev_backward(Tensor grad, Tensor bev, Tensor grid, bool border, bool align_corners, "
@@ -25,6 +26,24 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "sample_bev_double_backward(Tensor? grad_grad_bev, Tensor? grad_grad_grid, Tensor grad, Tensor bev, "
       "Tensor grid, bool border, bool align_corners, bool need_grad, bool need_bev, bool need_grid) -> "
       "(Tensor, Tensor, Tensor)");
+  m.def("sample_bev_with_grad(Tensor bev, Tensor grid, bool border, bool align_corners) -> (Tensor, Tensor)");
+  m.def(
+      "sample_bev_with_grad_backward(Tensor? grad_values, Tensor? grad_grads, Tensor bev, Tensor grid, bool border, "
+      "bool align_corners, bool need_bev, bool need_grid) -> (Tensor, Tensor)");
+
+  m.def("sample_volume(Tensor volume, Tensor grid, bool border, bool align_corners) -> Tensor");
+  m.def(
+      "sample_volume_backward(Tensor grad, Tensor volume, Tensor grid, bool border, bool align_corners, "
+      "bool need_volume, bool need_grid) -> (Tensor, Tensor)");
+  m.def(
+      "sample_volume_double_backward(Tensor? grad_grad_volume, Tensor? grad_grad_grid, Tensor grad, Tensor volume, "
+      "Tensor grid, bool border, bool align_corners, bool need_grad, bool need_volume, bool need_grid) -> "
+      "(Tensor, Tensor, Tensor)");
+  m.def("sample_volume_with_grad(Tensor volume, Tensor grid, bool border, bool align_corners) -> (Tensor, Tensor)");
+  m.def(
+      "sample_volume_with_grad_backward(Tensor? grad_values, Tensor? grad_grads, Tensor volume, Tensor grid, bool "
+      "border, "
+      "bool align_corners, bool need_volume, bool need_grid) -> (Tensor, Tensor)");
 
   m.def("segment_reduce(Tensor features, Tensor index, SymInt num_segments, str reduce) -> (Tensor, Tensor)");
   m.def("segment_reduce_backward(Tensor grad, Tensor index, Tensor saved, str reduce) -> Tensor");
@@ -45,21 +64,45 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "ball_query(Tensor points, Tensor batch_offsets, Tensor queries, Tensor query_offsets, float radius, "
       "SymInt max_points) -> (Tensor indices, Tensor counts)");
 
-  m.def("sdf_to_alpha(Tensor sdf, Tensor inv_s, bool last_opaque) -> Tensor");
+  m.def("sdf_to_alpha(Tensor sdf, Tensor inv_s, bool last_opaque, Tensor? ray_offsets=None) -> Tensor");
   m.def(
-      "sdf_to_alpha_backward(Tensor grad, Tensor sdf, Tensor inv_s, bool need_sdf, bool need_inv_s) -> "
-      "(Tensor, Tensor)");
+      "sdf_to_alpha_backward(Tensor grad, Tensor sdf, Tensor inv_s, bool need_sdf, bool need_inv_s, "
+      "Tensor? ray_offsets=None) -> (Tensor, Tensor)");
+  m.def(
+      "sdf_to_alpha_section(Tensor sdf, Tensor inv_s, Tensor cosine, Tensor section_length, Tensor cos_anneal, "
+      "float eps) -> Tensor");
+  m.def(
+      "sdf_to_alpha_section_backward(Tensor grad, Tensor sdf, Tensor inv_s, Tensor cosine, Tensor section_length, "
+      "Tensor cos_anneal, float eps, bool need_sdf, bool need_inv_s, bool need_cosine, bool need_section_length) -> "
+      "(Tensor, Tensor, Tensor, Tensor)");
+  m.def("sdf_to_alpha_density(Tensor density, Tensor section_length) -> Tensor");
+  m.def(
+      "sdf_to_alpha_density_backward(Tensor grad, Tensor density, Tensor section_length, bool need_density, "
+      "bool need_section_length) -> (Tensor, Tensor)");
 
   m.def(
-      "composite_rays(Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, bool depth_mid, bool last_opaque) -> "
-      "(Tensor weights, Tensor depth, Tensor opacity, Tensor values, Tensor remaining)");
+      "composite_rays(Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, Tensor? ray_offsets, bool depth_mid, "
+      "bool last_opaque) -> (Tensor weights, Tensor depth, Tensor opacity, Tensor values, Tensor remaining)");
   m.def(
       "composite_rays_backward(Tensor? grad_weights, Tensor? grad_depth, Tensor? grad_opacity, Tensor? grad_values, "
-      "Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, Tensor weights, Tensor remaining, bool depth_mid, "
-      "bool last_opaque, bool need_sdf, bool need_inv_s, bool need_t, bool need_values) -> "
+      "Tensor sdf, Tensor inv_s, Tensor t, Tensor? values, Tensor? ray_offsets, Tensor weights, Tensor remaining, "
+      "bool depth_mid, bool last_opaque, bool need_sdf, bool need_inv_s, bool need_t, bool need_values) -> "
       "(Tensor, Tensor, Tensor, Tensor)");
 
-  m.def("resample_rays(Tensor t, Tensor weights, Tensor u) -> Tensor");
+  m.def(
+      "composite_alpha(Tensor alpha, Tensor? t, Tensor? values, Tensor? ray_offsets, float eps, bool depth_mid) -> "
+      "(Tensor weights, Tensor depth, Tensor opacity, Tensor values)");
+  m.def(
+      "composite_alpha_backward(Tensor? grad_weights, Tensor? grad_depth, Tensor? grad_opacity, Tensor? grad_values, "
+      "Tensor alpha, Tensor? t, Tensor? values, Tensor? ray_offsets, float eps, bool depth_mid, bool need_alpha, "
+      "bool need_t, bool need_values) -> (Tensor, Tensor, Tensor)");
+
+  m.def(
+      "sample_pdf(Tensor edges, Tensor weights, Tensor u, str mode, float histogram_padding, float eps, "
+      "float min_width) -> Tensor");
+  m.def(
+      "resample_rays(Tensor t, Tensor weights, Tensor u, str mode, float histogram_padding, float eps, "
+      "float min_width) -> Tensor");
 }
 
 namespace pred {

@@ -106,14 +106,15 @@ def _no_kernel(op: str, device: str, required: bool) -> bool:
 
 
 def use_native(op: str, tensor: Tensor) -> bool:
-    """Whether ``op`` runs compiled for tensors like this one.
+    """Whether ``op`` runs compiled for tensors like this one. What is no tensor goes to the reference, whose checks
+    name it.
 
     Raises:
         ValueError: ``PRED_BACKEND`` has an unknown value.
         RuntimeError: it is ``native`` and the library or a kernel for the tensor's device is missing.
     """
     backend = _backend()
-    if backend == "reference":
+    if backend == "reference" or not isinstance(tensor, Tensor):
         return False
     if tensor.device.type == "cpu":
         return True
@@ -137,7 +138,14 @@ def register(
     if not available():
         return
     name = f"pred::{op}"
-    torch.library.register_fake(name, fake)
+
+    def checked_fake(*arguments: Any) -> Any:
+        try:
+            return fake(*arguments)
+        except IndexError as error:
+            raise ValueError(f"{op}: an argument has the wrong number of dimensions ({error})") from None
+
+    torch.library.register_fake(name, checked_fake)
 
     def refuse_vmap(*arguments: Any) -> None:
         raise RuntimeError(f"{op}: torch.vmap is not supported; call it once on the whole batch")

@@ -16,12 +16,12 @@ import pytest
 import torch
 
 from benchmarks import bench_ops, bench_step, cases
-from benchmarks.__main__ import parse
 from benchmarks.bench_ops import expected_results, make_cases, run_phase
 from benchmarks.case import BACKWARD, FORWARD, SECOND, Variant
 from benchmarks.cases import REAL, TINY
 from benchmarks.measure import Ceilings, Timing, time_interleaved
-from benchmarks.report import Row, Target, compare, format_comparisons, format_rows, format_table
+from benchmarks.options import parse
+from benchmarks.report import Row, Table, Target, compare, comparison_table, row_table
 from pred import _native
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -244,15 +244,15 @@ def test_comparison_is_with_the_fastest_eager_and_against_the_targets() -> None:
         "copy bandwidth": (pytest.approx(0.4), False),  # 8000 bytes in 0.02 s of 1e6 per second
         "eager's memory": (pytest.approx(3.0), False),
     }
-    shown = format_comparisons([comparison])
+    shown = comparison_table([comparison]).text()
     assert "3x eager: met (3.00x); 2x compiled: not measured" in shown
     assert "50% of copy bandwidth: falls short (40%); 1/4 of eager's memory: falls short (1/3.00)" in shown
-    table = format_rows(rows, ceilings)
+    table = row_table(rows, ceilings).text()
     assert "50k rays/s" in table and "40% copy" in table and "refused: no" in table
 
 
 def test_table_is_aligned() -> None:
-    assert format_table(["a", "empty", "b"], [["long", "", "1"], ["x", "", "23"]], right=(2,)).splitlines() == [
+    assert Table(("a", "empty", "b"), [["long", "", "1"], ["x", "", "23"]], right=(2,)).text().splitlines() == [
         "a      b",
         "----  --",
         "long   1",

@@ -34,11 +34,16 @@ struct PairAlpha {
   V lost;  // 1 - decay
 };
 
+// From rise = d_next - d itself, for those who know it better than the difference of d_next and d.
 template <typename V, typename T>
-PRED_HOST_DEVICE PairAlpha<V> pair_alpha(const ExpScale<T>& s, V sdf, V next_sdf, Phi<V> next) {
-  const V rise = next_sdf - sdf;
+PRED_HOST_DEVICE PairAlpha<V> alpha_of_rise(const ExpScale<T>& s, V rise, Phi<V> next) {
   const Exp<V> e = exp_nonpositive(s, rise >= V{} ? V{} : rise);  // NaN stays NaN
   return {next.occupied * -e.expm1, next.free + next.occupied * e.exp, e.exp, -e.expm1};
+}
+
+template <typename V, typename T>
+PRED_HOST_DEVICE PairAlpha<V> pair_alpha(const ExpScale<T>& s, V sdf, V next_sdf, Phi<V> next) {
+  return alpha_of_rise(s, next_sdf - sdf, next);
 }
 
 }  // namespace pred

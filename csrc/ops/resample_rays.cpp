@@ -5,17 +5,20 @@
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
 
+#include <string>
 #include <vector>
 
 #include "common/check.h"
 #include "common/parallel.h"
+#include "ops/read_pdf_rule.h"
 
 namespace pred {
 namespace {
 
 PRED_KERNELS_BY_TYPE(ResampleRaysKernels, resample_rays)
 
-Tensor resample_rays(const Tensor& t_in, const Tensor& weights_in, const Tensor& u_in) {
+Tensor resample_rays(const Tensor& t_in, const Tensor& weights_in, const Tensor& u_in, const std::string& mode,
+                     double histogram_padding, double eps, double min_width) {
   return PRED_DISPATCH_FLOAT("resample_rays", t_in.scalar_type(), [&] {
     const char* op = "resample_rays";
     const ScalarType dtype = t_in.scalar_type();
@@ -33,9 +36,14 @@ Tensor resample_rays(const Tensor& t_in, const Tensor& weights_in, const Tensor&
                new_samples);
     const Tensor t = torch::stable::contiguous(t_in), weights = torch::stable::contiguous(weights_in);
     const Tensor u = torch::stable::contiguous(u_in);
-    const ResampleRaysArgs<T> a{
-        t.const_data_ptr<T>(), weights.const_data_ptr<T>(),   u.const_data_ptr<T>(), samples, num_weights,
-        new_samples,           u.dim() == 1 ? 0 : new_samples};
+    const ResampleRaysArgs<T> a{t.const_data_ptr<T>(),
+                                weights.const_data_ptr<T>(),
+                                u.const_data_ptr<T>(),
+                                samples,
+                                num_weights,
+                                new_samples,
+                                u.dim() == 1 ? 0 : new_samples,
+                                read_pdf_rule<T>(op, mode, histogram_padding, eps, min_width)};
     Tensor merged = torch::stable::new_empty(t, {rays, samples + new_samples});
     T* out = merged.mutable_data_ptr<T>();
     const auto& k = kernels<T>();

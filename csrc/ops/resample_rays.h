@@ -1,15 +1,14 @@
 // Copyright 2026 The PRED authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// resample_rays: inverse-CDF samples of a ray's sections, merged with the ray's own samples.
+// resample_rays: inverse-CDF samples of a ray's sections (sample_pdf.h), merged with the ray's own samples.
 //
-// Sample k lies in the section i with cdf_i <= u_k < cdf_{i+1}, at t_i + (u_k - cdf_i) / (cdf_{i+1} - cdf_i)
-// (t_{i+1} - t_i). So t_i comes after exactly the c_i samples with u_k < cdf_i, and the merge needs no comparison of
-// ranges: it emits t_0, c_1 samples, t_1, c_2 - c_1 samples, and so on.
+// Exact rule: sample k lies in the section i with cdf_i <= u_k < cdf_{i+1}, at t_i + (u_k - cdf_i) / (cdf_{i+1} -
+// cdf_i) (t_{i+1} - t_i). So t_i comes after exactly the c_i samples with u_k < cdf_i, and the merge needs no
+// comparison of ranges: it emits t_0, c_1 samples, t_1, c_2 - c_1 samples, and so on.
 #pragma once
 
-#include "common/host_device.h"
-#include "common/isa.h"
+#include "ops/sample_pdf.h"
 
 namespace pred {
 
@@ -19,6 +18,7 @@ struct ResampleRaysArgs {
   const T* weights;  // [R, weight_stride]
   const T* u;        // [R, u_stride], or [num_new] with u_stride 0
   int64_t num_samples, weight_stride, num_new, u_stride;
+  PdfRule<T> rule;
 };
 
 // Ranges count rays.

@@ -5,6 +5,8 @@
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
 
+#include <algorithm>
+#include <optional>
 #include <tuple>
 #include <vector>
 
@@ -16,51 +18,212 @@ namespace {
 
 PRED_KERNELS_BY_TYPE(SdfToAlphaKernels, sdf_to_alpha)
 
-// Rays per task, such that a task takes some 50 microseconds.
-int64_t ray_grain(int64_t num_samples) { return 1 + 16384 / (num_samples + 1); }
+constexpr int64_t kGrain = 16384;  // samples per task: some 50 microseconds
+constexpr int64_t kGroup = 1024;   // samples of the rays that are worked on as one row
 
+// Rays of one length (sdf [R, S]) or of any (sdf [P] and ray_offsets [R + 1]), and their groups, each of whole rays.
 template <typename T>
-SdfToAlphaArgs<T> arguments(const char* op, const Tensor& sdf, const Tensor& inv_s, bool last_opaque) {
-  return {sdf.const_data_ptr<T>(), read_sharpness<T>(op, inv_s, sdf.scalar_type()), sdf.size(1), last_opaque};
-}
+struct Rays {
+  Tensor sdf, kept;
+  std::vector<int64_t> made;       // ray_offsets where none were given
+  std::vector<int64_t> group_end;  // the ray behind each group
+  int64_t largest_group = 0;       // in samples
+  PairAlphaArgs<T> args;
 
-Tensor sdf_to_alpha(const Tensor& sdf_in, const Tensor& inv_s, bool last_opaque) {
-  return PRED_DISPATCH_FLOAT("sdf_to_alpha", sdf_in.scalar_type(), [&] {
-    check_cpu_tensor("sdf_to_alpha", "sdf", sdf_in, 2, sdf_in.scalar_type());
-    const Tensor sdf = torch::stable::contiguous(sdf_in);
-    const auto a = arguments<T>("sdf_to_alpha", sdf, inv_s, last_opaque);
-    Tensor alpha = torch::stable::new_empty(sdf, {sdf.size(0), a.num_samples});
+  Rays(const char* op, const Tensor& sdf_in, const Tensor& inv_s, bool last_opaque,
+       const std::optional<Tensor>& ray_offsets) {
+    check_cpu_tensor(op, "sdf", sdf_in, ray_offsets ? 1 : 2, sdf_in.scalar_type());
+    sdf = torch::stable::contiguous(sdf_in);
+    args = {sdf.const_data_ptr<T>(), nullptr, read_sharpness<T>(op, inv_s, sdf.scalar_type()), last_opaque};
+    int64_t num_rays;
+    if (ray_offsets) {
+      check_cpu_tensor(op, "ray_offsets", *ray_offsets, 1, ScalarType::Long);
+      kept = torch::stable::contiguous(*ray_offsets);
+      args.ray_offsets = kept.const_data_ptr<int64_t>();
+      num_rays = kept.size(0) - 1;
+      PRED_CHECK(num_rays >= 0 && args.ray_offsets[0] == 0 && args.ray_offsets[num_rays] == sdf.size(0) &&
+                     std::is_sorted(args.ray_offsets, args.ray_offsets + num_rays + 1),
+                 op, ": ray_offsets must ascend from 0 to P=", sdf.size(0));
+    } else {
+      num_rays = sdf.size(0);
+      made.resize(num_rays + 1);
+      for (int64_t ray = 0; ray <= num_rays; ++ray) made[ray] = ray * sdf.size(1);
+      args.ray_offsets = made.data();
+    }
+    for (int64_t begin = 0, ray = 1; ray <= num_rays; ++ray) {
+      const int64_t size = args.ray_offsets[ray] - args.ray_offsets[begin];
+      if (ray < num_rays && args.ray_offsets[ray + 1] - args.ray_offsets[begin] <= kGroup) continue;
+      largest_group = std::max(largest_group, size);
+      group_end.push_back(ray);
+      begin = ray;
+    }
+  }
+
+  int64_t num_groups() const { return int64_t(group_end.size()); }
+
+  // body(group, first ray, the ray behind the last one)
+  template <class Body>
+  void for_groups(int64_t first, int64_t last, const Body& body) const {
+    for (int64_t group = first; group < last; ++group) {
+      body(group, group == 0 ? 0 : group_end[group - 1], group_end[group]);
+    }
+  }
+};
+
+Tensor sdf_to_alpha(const Tensor& sdf, const Tensor& inv_s, bool last_opaque, std::optional<Tensor> ray_offsets) {
+  return PRED_DISPATCH_FLOAT("sdf_to_alpha", sdf.scalar_type(), [&] {
+    const Rays<T> rays("sdf_to_alpha", sdf, inv_s, last_opaque, ray_offsets);
+    Tensor alpha = torch::stable::empty_like(rays.sdf);
     T* out = alpha.mutable_data_ptr<T>();
-    if (a.num_samples == 0) return alpha;
     const auto& k = kernels<T>();
-    parallel(sdf.size(0), ray_grain(a.num_samples), [&](int64_t begin, int64_t end) { k.forward(a, out, begin, end); });
+    parallel(rays.num_groups(), kGrain / kGroup, [&](int64_t first, int64_t last) {
+      rays.for_groups(first, last, [&](int64_t, int64_t begin, int64_t end) { k.pair(rays.args, out, begin, end); });
+    });
     return alpha;
   });
 }
 
-std::tuple<Tensor, Tensor> sdf_to_alpha_backward(const Tensor& grad_in, const Tensor& sdf_in, const Tensor& inv_s,
-                                                 bool need_sdf, bool need_inv_s) {
-  return PRED_DISPATCH_FLOAT("sdf_to_alpha_backward", sdf_in.scalar_type(), [&] {
+Tensor output(const Tensor& like, bool wanted) {
+  return wanted ? torch::stable::empty_like(like) : torch::stable::new_empty(like, {0});
+}
+
+template <typename T>
+T* data(Tensor& tensor, bool wanted) {
+  return wanted ? tensor.mutable_data_ptr<T>() : nullptr;
+}
+
+// A scalar, or nothing.
+template <typename T>
+Tensor total(const Tensor& like, bool wanted, const std::vector<double>& parts) {
+  Tensor sum = torch::stable::new_empty(like, std::vector<int64_t>(wanted ? 0 : 1, 0));
+  if (wanted) *sum.mutable_data_ptr<T>() = T(ordered_sum(parts));
+  return sum;
+}
+
+// Contiguous, with the dtype and shape of `like`.
+Tensor contiguous_like(const char* op, const char* name, const Tensor& tensor, const Tensor& like) {
+  check_cpu_tensor(op, name, tensor, like.dim(), like.scalar_type());
+  for (int64_t dim = 0; dim < like.dim(); ++dim) {
+    PRED_CHECK(tensor.size(dim) == like.size(dim), op, ": ", name, " must have shape ", shape_text(like), ", got ",
+               shape_text(tensor));
+  }
+  return torch::stable::contiguous(tensor);
+}
+
+std::tuple<Tensor, Tensor> sdf_to_alpha_backward(const Tensor& grad_in, const Tensor& sdf, const Tensor& inv_s,
+                                                 bool need_sdf, bool need_inv_s, std::optional<Tensor> ray_offsets) {
+  return PRED_DISPATCH_FLOAT("sdf_to_alpha_backward", sdf.scalar_type(), [&] {
     const char* op = "sdf_to_alpha_backward";
-    check_cpu_tensor(op, "sdf", sdf_in, 2, sdf_in.scalar_type());
-    check_cpu_tensor(op, "grad", grad_in, 2, sdf_in.scalar_type());
-    check_sizes(op, "grad", grad_in, {sdf_in.size(0), sdf_in.size(1)});
-    const Tensor sdf = torch::stable::contiguous(sdf_in), grad = torch::stable::contiguous(grad_in);
-    const auto a = arguments<T>(op, sdf, inv_s, false);
-    const int64_t rays = sdf.size(0), samples = a.num_samples;
-    Tensor grad_sdf = need_sdf ? torch::stable::new_empty(sdf, {rays, samples}) : torch::stable::new_empty(sdf, {0});
-    Tensor grad_inv_s = torch::stable::new_empty(sdf, std::vector<int64_t>(need_inv_s ? 0 : 1, 0));
-    T* out = need_sdf ? grad_sdf.mutable_data_ptr<T>() : nullptr;
-    std::vector<double> per_ray(need_inv_s ? rays : 0);
+    const Rays<T> rays(op, sdf, inv_s, false, ray_offsets);
+    const Tensor grad = contiguous_like(op, "grad", grad_in, rays.sdf);
+    Tensor grad_sdf = output(rays.sdf, need_sdf);
+    T* out = data<T>(grad_sdf, need_sdf);
+    std::vector<double> parts(need_inv_s ? rays.num_groups() : 0);
     const auto& k = kernels<T>();
-    if (samples > 0) {
-      parallel(rays, ray_grain(samples), [&](int64_t begin, int64_t end) {
-        std::vector<T> scratch(3 * samples);
-        k.backward(a, grad.const_data_ptr<T>(), out, need_inv_s ? per_ray.data() : nullptr, scratch.data(), begin, end);
+    parallel(rays.num_groups(), kGrain / kGroup, [&](int64_t first, int64_t last) {
+      std::vector<T> scratch(3 * rays.largest_group);
+      rays.for_groups(first, last, [&](int64_t group, int64_t begin, int64_t end) {
+        k.pair_backward(rays.args, grad.const_data_ptr<T>(), out, need_inv_s ? &parts[group] : nullptr, scratch.data(),
+                        begin, end);
       });
-    }
-    if (need_inv_s) *grad_inv_s.mutable_data_ptr<T>() = T(ordered_sum(per_ray));
-    return std::make_tuple(grad_sdf, grad_inv_s);
+    });
+    return std::make_tuple(grad_sdf, total<T>(rays.sdf, need_inv_s, parts));
+  });
+}
+
+// Contiguous copies of the arguments and the pointers into them.
+template <typename T>
+struct Sections {
+  Tensor sdf, cosine, length;
+  SectionAlphaArgs<T> args;
+
+  Sections(const char* op, const Tensor& sdf_in, const Tensor& inv_s, const Tensor& cosine_in, const Tensor& length_in,
+           const Tensor& cos_anneal, double eps) {
+    check_cpu_tensor(op, "cos_anneal", cos_anneal, 0, sdf_in.scalar_type());
+    sdf = contiguous_like(op, "sdf", sdf_in, sdf_in);
+    cosine = contiguous_like(op, "cosine", cosine_in, sdf);
+    length = contiguous_like(op, "section_length", length_in, sdf);
+    args = {sdf.const_data_ptr<T>(),
+            cosine.const_data_ptr<T>(),
+            length.const_data_ptr<T>(),
+            read_sharpness<T>(op, inv_s, sdf.scalar_type()),
+            {*cos_anneal.const_data_ptr<T>(), T(eps)}};
+  }
+};
+
+Tensor sdf_to_alpha_section(const Tensor& sdf, const Tensor& inv_s, const Tensor& cosine, const Tensor& section_length,
+                            const Tensor& cos_anneal, double eps) {
+  return PRED_DISPATCH_FLOAT("sdf_to_alpha_section", sdf.scalar_type(), [&] {
+    const Sections<T> in("sdf_to_alpha_section", sdf, inv_s, cosine, section_length, cos_anneal, eps);
+    Tensor alpha = torch::stable::empty_like(in.sdf);
+    T* out = alpha.mutable_data_ptr<T>();
+    const int64_t count = in.sdf.numel();
+    const auto& k = kernels<T>();
+    // Whole groups, so that a sample's place in its vector does not depend on the number of threads.
+    parallel((count + kGroup - 1) / kGroup, kGrain / kGroup, [&](int64_t first, int64_t last) {
+      k.section(in.args, out, first * kGroup, std::min(last * kGroup, count));
+    });
+    return alpha;
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> sdf_to_alpha_section_backward(
+    const Tensor& grad_in, const Tensor& sdf, const Tensor& inv_s, const Tensor& cosine, const Tensor& section_length,
+    const Tensor& cos_anneal, double eps, bool need_sdf, bool need_inv_s, bool need_cosine, bool need_length) {
+  return PRED_DISPATCH_FLOAT("sdf_to_alpha_section_backward", sdf.scalar_type(), [&] {
+    const char* op = "sdf_to_alpha_section_backward";
+    const Sections<T> in(op, sdf, inv_s, cosine, section_length, cos_anneal, eps);
+    const Tensor grad = contiguous_like(op, "grad", grad_in, in.sdf);
+    Tensor grad_sdf = output(in.sdf, need_sdf), grad_cosine = output(in.sdf, need_cosine);
+    Tensor grad_length = output(in.sdf, need_length);
+    const SectionAlphaGradients<T> out{data<T>(grad_sdf, need_sdf), data<T>(grad_cosine, need_cosine),
+                                       data<T>(grad_length, need_length)};
+    const int64_t count = in.sdf.numel(), groups = (count + kGroup - 1) / kGroup;
+    std::vector<double> parts(groups);
+    const auto& k = kernels<T>();
+    parallel(groups, kGrain / kGroup, [&](int64_t first, int64_t last) {
+      for (int64_t group = first; group < last; ++group) {
+        parts[group] = k.section_backward(in.args, grad.const_data_ptr<T>(), out, group * kGroup,
+                                          std::min((group + 1) * kGroup, count));
+      }
+    });
+    return std::make_tuple(grad_sdf, total<T>(in.sdf, need_inv_s, parts), grad_cosine, grad_length);
+  });
+}
+
+Tensor sdf_to_alpha_density(const Tensor& density_in, const Tensor& length_in) {
+  return PRED_DISPATCH_FLOAT("sdf_to_alpha_density", density_in.scalar_type(), [&] {
+    const char* op = "sdf_to_alpha_density";
+    const Tensor density = contiguous_like(op, "density", density_in, density_in);
+    const Tensor length = contiguous_like(op, "section_length", length_in, density);
+    const DensityAlphaArgs<T> a{density.const_data_ptr<T>(), length.const_data_ptr<T>()};
+    Tensor alpha = torch::stable::empty_like(density);
+    T* out = alpha.mutable_data_ptr<T>();
+    const int64_t count = density.numel();
+    const auto& k = kernels<T>();
+    parallel((count + kGroup - 1) / kGroup, kGrain / kGroup,
+             [&](int64_t first, int64_t last) { k.density(a, out, first * kGroup, std::min(last * kGroup, count)); });
+    return alpha;
+  });
+}
+
+std::tuple<Tensor, Tensor> sdf_to_alpha_density_backward(const Tensor& grad_in, const Tensor& density_in,
+                                                         const Tensor& length_in, bool need_density, bool need_length) {
+  return PRED_DISPATCH_FLOAT("sdf_to_alpha_density_backward", density_in.scalar_type(), [&] {
+    const char* op = "sdf_to_alpha_density_backward";
+    const Tensor density = contiguous_like(op, "density", density_in, density_in);
+    const Tensor length = contiguous_like(op, "section_length", length_in, density);
+    const Tensor grad = contiguous_like(op, "grad", grad_in, density);
+    const DensityAlphaArgs<T> a{density.const_data_ptr<T>(), length.const_data_ptr<T>()};
+    Tensor grad_density = output(density, need_density), grad_length = output(density, need_length);
+    T *density_out = data<T>(grad_density, need_density), *length_out = data<T>(grad_length, need_length);
+    const int64_t count = density.numel();
+    const auto& k = kernels<T>();
+    parallel((count + kGroup - 1) / kGroup, kGrain / kGroup, [&](int64_t first, int64_t last) {
+      k.density_backward(a, grad.const_data_ptr<T>(), density_out, length_out, first * kGroup,
+                         std::min(last * kGroup, count));
+    });
+    return std::make_tuple(grad_density, grad_length);
   });
 }
 
@@ -70,4 +233,8 @@ std::tuple<Tensor, Tensor> sdf_to_alpha_backward(const Tensor& grad_in, const Te
 STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) {
   m.impl("sdf_to_alpha", TORCH_BOX(&pred::sdf_to_alpha));
   m.impl("sdf_to_alpha_backward", TORCH_BOX(&pred::sdf_to_alpha_backward));
+  m.impl("sdf_to_alpha_section", TORCH_BOX(&pred::sdf_to_alpha_section));
+  m.impl("sdf_to_alpha_section_backward", TORCH_BOX(&pred::sdf_to_alpha_section_backward));
+  m.impl("sdf_to_alpha_density", TORCH_BOX(&pred::sdf_to_alpha_density));
+  m.impl("sdf_to_alpha_density_backward", TORCH_BOX(&pred::sdf_to_alpha_density_backward));
 }

@@ -1,33 +1,66 @@
 // Copyright 2026 The PRED authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// sdf_to_alpha: the opacities of math/pair_alpha.h as a tensor, and their gradient. With next = s d_{i+1}:
+// sdf_to_alpha: opacities as a tensor, and their gradient.
+//
+// Pair: the opacities of math/pair_alpha.h. With next = s d_{i+1}:
 //   dalpha_i / d(s d_i)     =  Phi(-next) decay
 //   dalpha_i / d(s d_{i+1}) = -Phi(-next) (1 - alpha)
 //   dalpha_i / ds           =  Phi(-next) (decay (d_i - d_{i+1}) - Phi(next) (1 - decay) d_{i+1})
 // and all three are 0 where the distance does not fall.
+// Section: those of math/section_alpha.h, element by element.
+// Density: alpha = 1 - exp(-density length), element by element.
 #pragma once
 
 #include "common/isa.h"
-#include "math/pair_alpha.h"
+#include "math/section_alpha.h"
 
 namespace pred {
 
+// Ray r is samples [ray_offsets[r], ray_offsets[r + 1]).
 template <typename T>
-struct SdfToAlphaArgs {
-  const T* sdf;  // [R, S]
+struct PairAlphaArgs {
+  const T* sdf;                // [P]
+  const int64_t* ray_offsets;  // [R + 1]
   T inv_s;
-  int64_t num_samples;
   bool last_opaque;
 };
 
-// Ranges count rays.
+template <typename T>
+struct SectionAlphaArgs {
+  const T *sdf, *cosine, *length;  // [P]
+  T inv_s;
+  SectionShape<T> shape;
+};
+
+// Gradients of the inputs; null where not wanted.
+template <typename T>
+struct SectionAlphaGradients {
+  T *sdf, *cosine, *length;  // [P]
+};
+
+template <typename T>
+struct DensityAlphaArgs {
+  const T *density, *length;  // [P]
+};
+
 template <typename T>
 struct SdfToAlphaKernels {
-  void (*forward)(const SdfToAlphaArgs<T>&, T* alpha, int64_t begin, int64_t end);
-  // grad, grad_sdf [R, S]; grad_inv_s [R] holds each ray's part; scratch [3, S]. Either output may be null.
-  void (*backward)(const SdfToAlphaArgs<T>&, const T* grad, T* grad_sdf, double* grad_inv_s, T* scratch, int64_t begin,
-                   int64_t end);
+  // Ranges count rays; they are worked on as one row.
+  void (*pair)(const PairAlphaArgs<T>&, T* alpha, int64_t begin, int64_t end);
+  // grad, grad_sdf [P]; scratch holds 3 times the samples of the range. Either output may be null; grad_inv_s is the
+  // range's part.
+  void (*pair_backward)(const PairAlphaArgs<T>&, const T* grad, T* grad_sdf, double* grad_inv_s, T* scratch,
+                        int64_t begin, int64_t end);
+  // Ranges count samples.
+  void (*section)(const SectionAlphaArgs<T>&, T* alpha, int64_t begin, int64_t end);
+  // Returns the range's part of the gradient of inv_s.
+  double (*section_backward)(const SectionAlphaArgs<T>&, const T* grad, const SectionAlphaGradients<T>&, int64_t begin,
+                             int64_t end);
+  void (*density)(const DensityAlphaArgs<T>&, T* alpha, int64_t begin, int64_t end);
+  // Either output may be null.
+  void (*density_backward)(const DensityAlphaArgs<T>&, const T* grad, T* grad_density, T* grad_length, int64_t begin,
+                           int64_t end);
 };
 
 }  // namespace pred

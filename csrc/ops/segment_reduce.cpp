@@ -16,17 +16,7 @@
 namespace pred {
 namespace {
 
-template <typename S>
-const SegmentReduceKernels<S>& kernels() {
-  if constexpr (std::is_same_v<S, float>)
-    return PRED_KERNELS(segment_reduce_f32);
-  else if constexpr (std::is_same_v<S, double>)
-    return PRED_KERNELS(segment_reduce_f64);
-  else if constexpr (std::is_same_v<S, BFloat16>)
-    return PRED_KERNELS(segment_reduce_bf16);
-  else
-    return PRED_KERNELS(segment_reduce_f16);
-}
+PRED_KERNELS_BY_STORAGE(SegmentReduceKernels, segment_reduce)
 
 SegmentReduction reduction(const char* op, const std::string& name) {
   if (name == "sum") return SegmentReduction::kSum;

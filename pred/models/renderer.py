@@ -206,6 +206,7 @@ class Renderer:
             normalize_depth=self.config.normalize_depth,
             detach_sdf=detach_sdf,
         )
+        assert composite.depth is not None  # it is with `t`
         rays = (num_frames, num_rays)
         gradient = decoded.gradient
         return RenderedRays(

@@ -10,6 +10,14 @@ import torch
 from torch import Tensor
 
 FLOATING = (torch.float32, torch.float64)
+HALF = (torch.bfloat16, torch.float16)
+
+
+def check_tensors(op: str, **arguments: object) -> None:
+    """Each must be a tensor."""
+    for name, value in arguments.items():
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{op}: {name} must be a tensor, got {type(value).__name__}")
 
 
 def check_shape(op: str, name: str, tensor: Tensor, shape: Sequence[int | str], where: str = "") -> None:
@@ -40,11 +48,41 @@ def check_like(op: str, name: str, tensor: Tensor, other_name: str, other: Tenso
 
 def widen(tensor: Tensor) -> Tensor:
     """In a half-precision (autocast) region: the tensor in float32 if it is narrower."""
-    half = tensor.dtype in (torch.bfloat16, torch.float16)
-    return tensor.float() if half and torch.is_autocast_enabled(tensor.device.type) else tensor
+    return tensor.float() if tensor.dtype in HALF and torch.is_autocast_enabled(tensor.device.type) else tensor
+
+
+def as_geometry(tensor: Tensor) -> Tensor:
+    """In float32 if it is narrower: positions, distances and weights are too coarse in half precision."""
+    return tensor.float() if tensor.dtype in HALF else tensor
+
+
+def check_features(op: str, name: str, features: Tensor, other_name: str, geometry: Tensor) -> None:
+    """``features`` must have the device and dtype of ``geometry``, or be half precision beside float32."""
+    half = features.dtype in HALF and geometry.dtype == torch.float32
+    check_like(op, name, features.new_empty(0, dtype=torch.float32) if half else features, other_name, geometry)
 
 
 def check_choice(op: str, name: str, value: str, choices: Sequence[str]) -> None:
     """``value`` must be one of ``choices``."""
     if value not in choices:
         raise ValueError(f"{op}: {name} must be one of {', '.join(choices)}, got {value!r}")
+
+
+def check_offsets(op: str, name: str, offsets: Tensor, letters: str, other_name: str, other: Tensor) -> None:
+    """``offsets`` must be int64 and ascend from 0 to the rows of ``other``; values are looked at in eager CPU calls.
+
+    ``letters``: of what the offsets divide the rows into, and of the rows, such as ``"RP"`` for rays and samples.
+    """
+    parts, rows = letters[0], letters[1]
+    check_shape(op, name, offsets, (f"{parts} + 1",))
+    check_dtype(op, name, offsets, (torch.int64,))
+    if offsets.device != other.device:
+        raise ValueError(f"{op}: {name} must be on the device of {other_name} ({other.device}), got {offsets.device}")
+    if offsets.shape[0] == 0:
+        raise ValueError(f"{op}: {name} must have shape [{parts} + 1] with {parts} >= 0, got [0]")
+    if torch.compiler.is_compiling() or offsets.device.type != "cpu":
+        return
+    count = other.shape[0]
+    if offsets[0] != 0 or offsets[-1] != count or (offsets[1:] < offsets[:-1]).any():
+        shown = offsets.tolist() if offsets.shape[0] <= 16 else f"{offsets[:8].tolist()} ... {int(offsets[-1])}"
+        raise ValueError(f"{op}: {name} must ascend from 0 to {rows}={count}, got {shown}")

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._clouds import check_offsets, frame_slices, positions, squared_distances
+from pred.ops._check import check_offsets, check_tensors
+from pred.ops._clouds import frame_slices, positions, squared_distances
 
 
 def farthest_point_sample(
@@ -62,8 +63,9 @@ def farthest_point_sample_reference(
 
 def _arguments(points: Tensor, batch_offsets: Tensor, num_samples: int, start: int) -> Tensor:
     op = "farthest_point_sample"
+    check_tensors(op, points=points, batch_offsets=batch_offsets)
     xyz = positions(op, "points", points)
-    check_offsets(op, "batch_offsets", batch_offsets, "N", points.shape[0], "points", points)
+    check_offsets(op, "batch_offsets", batch_offsets, "BN", "points", points)
     for name, number in (("num_samples", num_samples), ("start", start)):
         if number < 0:
             raise ValueError(f"{op}: {name} must not be negative, got {number}")

@@ -1,6 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""Opacity of ray samples from signed distances."""
+"""Opacity of ray samples from signed distances or densities."""
 
 from __future__ import annotations
 
@@ -11,80 +11,236 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, check_choice, check_dtype, check_shape, widen
+from pred.ops._check import (
+    FLOATING,
+    as_geometry,
+    check_choice,
+    check_dtype,
+    check_like,
+    check_offsets,
+    check_shape,
+    check_tensors,
+)
 
 
 def sdf_to_alpha(
-    sdf: Tensor,  # [R, S]
-    inv_s: Tensor | float,
+    sdf: Tensor,  # [R, S], [R, S, 1] or [P]
+    inv_s: Tensor | float | None = None,
     mode: str = "pair",
     last: str = "zero",
-) -> Tensor:  # [R, S]
-    """Opacity of each sample from the signed distances at it and at the next one (PRED, Eq. 4).
+    *,
+    cosine: Tensor | None = None,  # as sdf
+    section_length: Tensor | None = None,  # as sdf
+    cos_anneal: float = 1.0,
+    eps: float = 0.0,
+    ray_offsets: Tensor | None = None,  # [R + 1]
+) -> Tensor:  # [R, S] or [P]
+    """Opacity of each sample of a ray, in one of three ways. ``Phi(d) = sigmoid(inv_s d)``.
 
-    ``alpha_i = max((Phi(d_i) - Phi(d_{i+1})) / Phi(d_i), 0)`` with ``Phi(d) = sigmoid(inv_s d)``, computed as
+    ``"pair"`` (PRED, Eq. 4) takes the signed distances at a sample and at the next one:
+    ``alpha_i = max((Phi(d_i) - Phi(d_{i+1})) / Phi(d_i), 0)``, computed as
     ``sigmoid(-inv_s d_{i+1}) * -expm1(-inv_s max(d_i - d_{i+1}, 0))``, which neither cancels nor divides 0 by 0.
 
+    ``"section"`` (NeuS, Eq. 13 and its code; UniPAD, PonderV2) takes one distance and the angle between ray and normal.
+    The distance falls at the rate ``f = relu(0.5 - 0.5 cosine) (1 - cos_anneal) + relu(-cosine) cos_anneal``, so that
+    the section's ends are at ``d_prev = d + f section_length / 2`` and ``d_next = d - f section_length / 2``. With
+    ``eps = 0``, ``alpha = (Phi(d_prev) - Phi(d_next)) / Phi(d_prev)`` in the closed form above; with ``eps > 0``,
+    ``clip((Phi(d_prev) - Phi(d_next) + eps) / (Phi(d_prev) + eps), 0, 1)`` in this order of operations, as published
+    (``eps = 1e-5``). The published form is wrong inside of surfaces (opacity 1 where the distance rises) and in free
+    space (opacity ``eps`` per sample); it is there for parity.
+
+    ``"density"`` (NeRF, nerfacc): ``alpha = 1 - exp(-density section_length)`` by ``expm1``.
+
     Args:
-        sdf: ``[R, S]`` or ``[R, S, 1]`` signed distances along each ray, float32 or float64, in metres; positive in
-            front of the surface.
+        sdf: signed distances along each ray in metres, positive in front of the surface; ``[R, S]`` or ``[R, S, 1]``,
+            or ``[P]``: packed rays in mode pair, any samples in the other modes. In mode section, the distance at the
+            middle of the section (NeuS) or at its start (UniPAD); in mode density, the density per metre. float32 or
+            float64; half precision is widened to float32.
         inv_s: sharpness per metre, finite and not negative: a number, or a tensor of one element on the device of
-            ``sdf``.
-        mode: ``"pair"`` is what exists.
-        last: opacity of the last sample, which has no successor: ``"zero"`` or ``"opaque"`` (1).
+            ``sdf``. None in mode density.
+        mode: ``"pair"``, ``"section"`` or ``"density"``.
+        last: mode pair: opacity of a ray's last sample, which has no successor: ``"zero"`` or ``"opaque"`` (1).
+        cosine: mode section: product of ray direction and normal, not clipped; shape and dtype of ``sdf``.
+        section_length: modes section and density: metres from each sample to the next; shape and dtype of ``sdf``.
+        cos_anneal: mode section: 0 (a ray counts as half facing the surface, so that none is without gradient, NeuS's
+            start) to 1 (the true angle).
+        eps: mode section: 0, or the published formula's constant.
+        ray_offsets: mode pair: packed rays, ray r being samples ``[ray_offsets[r], ray_offsets[r + 1])`` of ``[P]``;
+            int64, ascending from 0 to P.
 
     Returns:
-        ``[R, S]`` in [0, 1]; exactly 0 where the distance does not fall. A NaN distance stays in its ray.
+        ``[R, S]`` (also for ``[R, S, 1]``) or ``[P]``. In [0, 1]; exactly 0 where the distance does not fall (except
+        with ``eps > 0``). A negative density gives a negative opacity, as its formula does. A NaN stays in its ray,
+        in modes section and density in its sample.
 
     Raises:
-        ValueError: shape, device, ``mode``, ``last``, or the value of ``inv_s`` (except for a tensor on another device
-            than the CPU, where a wrong value makes everything NaN). TypeError: dtype.
+        ValueError: shape, device, range, an unknown choice, an argument that the mode does not have, or the value of
+            ``inv_s`` or ``ray_offsets`` (except for tensors on another device than the CPU, where a wrong ``inv_s``
+            makes everything NaN). TypeError: dtype.
 
-    Differentiable once in ``sdf`` and ``inv_s``; the derivative of ``max`` at a tie is 0. Deterministic for any thread
-    count.
+    Differentiable once in ``sdf``, ``inv_s``, ``cosine`` and ``section_length``. The derivative of ``max`` at a tie and
+    of ``relu`` at 0 is 0; that of ``clip`` on its bounds is 1, as in PyTorch. Deterministic for any thread count.
     """
-    if not _native.use_native("sdf_to_alpha", sdf):
-        return sdf_to_alpha_reference(sdf, inv_s, mode, last)
-    sdf, inv_s = sdf_arguments("sdf_to_alpha", sdf, inv_s, mode, last)
-    out: Tensor = torch.ops.pred.sdf_to_alpha(sdf, inv_s, last == "opaque")
+    use_native = _native.use_native("sdf_to_alpha", sdf)
+    if not use_native:
+        return sdf_to_alpha_reference(
+            sdf,
+            inv_s,
+            mode,
+            last,
+            cosine=cosine,
+            section_length=section_length,
+            cos_anneal=cos_anneal,
+            eps=eps,
+            ray_offsets=ray_offsets,
+        )
+    _check_mode(mode, inv_s, last, cosine, section_length, cos_anneal, eps, ray_offsets)
+    out: Tensor
+    if inv_s is None:
+        out = torch.ops.pred.sdf_to_alpha_density(*_elementwise("density", sdf, section_length=section_length))
+    elif mode == "section":
+        inv_s, (sdf, cosine, length) = _section(sdf, inv_s, cosine, section_length)
+        out = torch.ops.pred.sdf_to_alpha_section(sdf, inv_s, cosine, length, _scalar(cos_anneal, sdf), eps)
+    else:
+        sdf, inv_s = sdf_arguments("sdf_to_alpha", sdf, inv_s, mode, last, ray_offsets)
+        out = torch.ops.pred.sdf_to_alpha(sdf, inv_s, last == "opaque", ray_offsets)
     return out
 
 
 def sdf_to_alpha_reference(
-    sdf: Tensor,  # [R, S]
-    inv_s: Tensor | float,
+    sdf: Tensor,  # [R, S], [R, S, 1] or [P]
+    inv_s: Tensor | float | None = None,
     mode: str = "pair",
     last: str = "zero",
-) -> Tensor:  # [R, S]
+    *,
+    cosine: Tensor | None = None,  # as sdf
+    section_length: Tensor | None = None,  # as sdf
+    cos_anneal: float = 1.0,
+    eps: float = 0.0,
+    ray_offsets: Tensor | None = None,  # [R + 1]
+) -> Tensor:  # [R, S] or [P]
     """Plain PyTorch form of :func:`sdf_to_alpha`, differentiable any number of times."""
-    sdf, inv_s = sdf_arguments("sdf_to_alpha", sdf, inv_s, mode, last)
+    _check_mode(mode, inv_s, last, cosine, section_length, cos_anneal, eps, ray_offsets)
+    if inv_s is None:
+        density, length = _elementwise("density", sdf, section_length=section_length)
+        return -torch.expm1(-density * length)
+    if mode == "section":
+        inv_s, (sdf, cosine, length) = _section(sdf, inv_s, cosine, section_length)
+        inv_s = valid_sharpness("sdf_to_alpha", inv_s)
+        fall = torch.relu(0.5 - 0.5 * cosine) * (1 - cos_anneal) + torch.relu(-cosine) * cos_anneal
+        half = fall * length * 0.5
+        if eps == 0:
+            return _closed_form(inv_s, sdf - half, (fall * length).clamp(min=0))
+        start, end = torch.sigmoid(inv_s * (sdf + half)), torch.sigmoid(inv_s * (sdf - half))
+        return ((start - end + eps) / (start + eps)).clip(0, 1)
+    sdf, inv_s = sdf_arguments("sdf_to_alpha", sdf, inv_s, mode, last, ray_offsets)
     inv_s = valid_sharpness("sdf_to_alpha", inv_s)
-    drop = torch.relu(sdf[:, :-1] - sdf[:, 1:])  # relu: derivative 0 at a tie
-    alpha = torch.sigmoid(-inv_s * sdf[:, 1:]) * -torch.expm1(-inv_s * drop)
-    end = torch.full_like(sdf[:, :1], 1.0 if last == "opaque" else 0.0)
-    return torch.cat([alpha, end], dim=1)
+    end_alpha = 1.0 if last == "opaque" else 0.0
+    if ray_offsets is None:
+        alpha = _closed_form(inv_s, sdf[:, 1:], torch.relu(sdf[:, :-1] - sdf[:, 1:]))  # relu: derivative 0 at a tie
+        return torch.cat([alpha, torch.full_like(sdf[:, :1], end_alpha)], dim=1)
+    sample = torch.arange(sdf.shape[0], device=sdf.device)
+    ray_end = ray_offsets[1:].contiguous()
+    is_last = sample + 1 == ray_end[torch.searchsorted(ray_end, sample, right=True)]
+    after = sdf[torch.where(is_last, sample, sample + 1)]
+    return torch.where(is_last, end_alpha, _closed_form(inv_s, after, torch.relu(sdf - after)))
 
 
-def sdf_arguments(op: str, sdf: Tensor, inv_s: Tensor | float, mode: str, last: str) -> tuple[Tensor, Tensor]:
-    """Checked ``sdf`` as ``[R, S]`` and ``inv_s`` as a tensor without dimensions, of one dtype."""
+def _closed_form(inv_s: Tensor, next_sdf: Tensor, drop: Tensor) -> Tensor:
+    return torch.sigmoid(-inv_s * next_sdf) * -torch.expm1(-inv_s * drop)
+
+
+def _check_mode(
+    mode: str,
+    inv_s: Tensor | float | None,
+    last: str,
+    cosine: Tensor | None,
+    section_length: Tensor | None,
+    cos_anneal: float,
+    eps: float,
+    ray_offsets: Tensor | None,
+) -> None:
+    op = "sdf_to_alpha"
+    check_choice(op, "mode", mode, ("pair", "section", "density"))
+    check_choice(op, "last", last, ("zero", "opaque"))
+    needed = {"pair": ("inv_s",), "section": ("inv_s", "cosine", "section_length"), "density": ("section_length",)}
+    given = {"inv_s": inv_s, "cosine": cosine, "section_length": section_length, "ray_offsets": ray_offsets}
+    for name, value in given.items():
+        if value is None and name in needed[mode]:
+            raise ValueError(f"{op}: {name} must be given in mode {mode!r}, got None")
+        if value is not None and name not in needed[mode] and not (name == "ray_offsets" and mode == "pair"):
+            raise ValueError(f"{op}: {name} must be None in mode {mode!r}, got a value")
+    if mode != "pair" and last != "zero":
+        raise ValueError(f"{op}: last must be 'zero' in mode {mode!r}, where every sample has an end, got {last!r}")
+    if not 0 <= cos_anneal <= 1:
+        raise ValueError(f"{op}: cos_anneal must be in [0, 1], got {cos_anneal}")
+    if not 0 <= eps < math.inf:
+        raise ValueError(f"{op}: eps must be finite and not negative, got {eps}")
+
+
+def _flat(tensor: Tensor) -> Tensor:
+    """Without the last dimension of ``[R, S, 1]``, in float32 at least."""
+    return as_geometry(tensor[..., 0] if tensor.dim() == 3 and tensor.shape[2] == 1 else tensor)
+
+
+def _elementwise(name: str, first: Tensor, **others: Tensor | None) -> list[Tensor]:
+    """``first``, ``[R, S]`` or ``[P]``, and other tensors of its shape."""
+    op = "sdf_to_alpha"
+    check_tensors(op, **{name: first}, **others)
+    first = _flat(first)
+    if first.dim() not in (1, 2):
+        raise ValueError(f"{op}: {name} must have shape [R, S], [R, S, 1] or [P], got {list(first.shape)}")
+    check_dtype(op, name, first, FLOATING)
+    tensors = [first]
+    for other_name, other in others.items():
+        assert other is not None  # by _check_mode
+        tensors.append(_flat(other))
+        check_shape(op, other_name, tensors[-1], first.shape, f" as {name}")
+        check_like(op, other_name, tensors[-1], name, first)
+    return tensors
+
+
+def _section(
+    sdf: Tensor, inv_s: Tensor | float, cosine: Tensor | None, section_length: Tensor | None
+) -> tuple[Tensor, list[Tensor]]:
+    tensors = _elementwise("sdf", sdf, cosine=cosine, section_length=section_length)
+    return _sharpness("sdf_to_alpha", inv_s, tensors[0]), tensors
+
+
+def sdf_arguments(
+    op: str, sdf: Tensor, inv_s: Tensor | float, mode: str, last: str, ray_offsets: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Checked ``sdf`` of mode pair as ``[R, S]`` or ``[P]`` and ``inv_s`` without dimensions, of one dtype."""
+    check_tensors(op, sdf=sdf, **({} if ray_offsets is None else {"ray_offsets": ray_offsets}))
     check_choice(op, "mode", mode, ("pair",))
     check_choice(op, "last", last, ("zero", "opaque"))
-    if sdf.dim() == 3 and sdf.shape[2] == 1:
-        sdf = sdf[..., 0]
-    check_shape(op, "sdf", sdf, ("R", "S"))
-    sdf = widen(sdf)
+    sdf = _flat(sdf)
+    check_shape(op, "sdf", sdf, ("R", "S") if ray_offsets is None else ("P",))
     check_dtype(op, "sdf", sdf, FLOATING)
+    if ray_offsets is not None:
+        check_offsets(op, "ray_offsets", ray_offsets, "RP", "sdf", sdf)
+    return sdf, _sharpness(op, inv_s, sdf)
+
+
+def _sharpness(op: str, inv_s: Tensor | float, sdf: Tensor) -> Tensor:
+    """The sharpness as a tensor without dimensions, of the dtype of ``sdf``."""
     if not isinstance(inv_s, Tensor):
-        if not (inv_s >= 0 and math.isfinite(inv_s)):
+        if not 0 <= inv_s < math.inf:
             raise ValueError(f"{op}: inv_s must be finite and not negative, got {inv_s}")
-        return sdf, sdf.new_full((), inv_s)
+        return _scalar(inv_s, sdf)
     if inv_s.numel() != 1:
         raise ValueError(f"{op}: inv_s must have one element, got shape {list(inv_s.shape)}")
     if not inv_s.is_floating_point():
         raise TypeError(f"{op}: inv_s must be a floating-point tensor, got {inv_s.dtype}")
     if inv_s.device != sdf.device:
         raise ValueError(f"{op}: inv_s must be on the device of sdf ({sdf.device}), got {inv_s.device}")
-    return sdf, inv_s.reshape(()).to(sdf.dtype)
+    return inv_s.reshape(()).to(sdf.dtype)
+
+
+def _scalar(value: float, like: Tensor) -> Tensor:
+    """A number that may change with every training step, as a tensor; torch.compile would make new_full() a constant
+    of the graph."""
+    return like.new_ones(()) * value
 
 
 def valid_sharpness(op: str, inv_s: Tensor) -> Tensor:
@@ -95,25 +251,90 @@ def valid_sharpness(op: str, inv_s: Tensor) -> Tensor:
     return torch.where(valid, inv_s, torch.nan)
 
 
-def _fake(sdf: Tensor, inv_s: Tensor, opaque: bool) -> Tensor:
+def _wanted(tensors: tuple[Tensor, ...], needs: tuple[bool, ...]) -> tuple[Tensor | None, ...]:
+    return tuple(tensor if need else None for tensor, need in zip(tensors, needs, strict=True))
+
+
+def _fake(sdf: Tensor, inv_s: Tensor, opaque: bool, ray_offsets: Tensor | None = None) -> Tensor:
     return sdf.new_empty(sdf.shape)
 
 
 def _save(ctx: Any, inputs: Any, output: Any) -> None:
-    sdf, inv_s, _ = inputs
-    ctx.save_for_backward(sdf, inv_s)
+    sdf, inv_s, _, ray_offsets = inputs
+    ctx.save_for_backward(sdf, inv_s, ray_offsets)
 
 
 def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    sdf, inv_s = ctx.saved_tensors
-    need_sdf, need_inv_s = ctx.needs_input_grad[:2]
-    grad_sdf, grad_inv_s = torch.ops.pred.sdf_to_alpha_backward(grad, sdf, inv_s, need_sdf, need_inv_s)
-    return grad_sdf if need_sdf else None, grad_inv_s if need_inv_s else None, None
+    sdf, inv_s, ray_offsets = ctx.saved_tensors
+    needs = ctx.needs_input_grad[:2]
+    grads = torch.ops.pred.sdf_to_alpha_backward(grad, sdf, inv_s, *needs, ray_offsets)
+    return *_wanted(grads, needs), None, None
 
 
-def _fake_backward(grad: Tensor, sdf: Tensor, inv_s: Tensor, need_sdf: bool, need_inv_s: bool) -> tuple[Tensor, Tensor]:
+def _fake_backward(
+    grad: Tensor, sdf: Tensor, inv_s: Tensor, need_sdf: bool, need_inv_s: bool, ray_offsets: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     return sdf.new_empty(sdf.shape if need_sdf else 0), sdf.new_empty(() if need_inv_s else 0)
+
+
+def _fake_section(
+    sdf: Tensor, inv_s: Tensor, cosine: Tensor, section_length: Tensor, cos_anneal: Tensor, eps: float
+) -> Tensor:
+    return sdf.new_empty(sdf.shape)
+
+
+def _save_section(ctx: Any, inputs: Any, output: Any) -> None:
+    *tensors, ctx.eps = inputs
+    ctx.save_for_backward(*tensors)
+
+
+def _backward_section(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+    needs = ctx.needs_input_grad[:4]
+    grads = torch.ops.pred.sdf_to_alpha_section_backward(grad, *ctx.saved_tensors, ctx.eps, *needs)
+    return *_wanted(grads, needs), None, None
+
+
+def _fake_section_backward(
+    grad: Tensor,
+    sdf: Tensor,
+    inv_s: Tensor,
+    cosine: Tensor,
+    section_length: Tensor,
+    cos_anneal: Tensor,
+    eps: float,
+    need_sdf: bool,
+    need_inv_s: bool,
+    need_cosine: bool,
+    need_section_length: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    shapes = [sdf.shape if need else (0,) for need in (need_sdf, need_cosine, need_section_length)]
+    of_sdf, of_cosine, of_length = (sdf.new_empty(shape) for shape in shapes)
+    return of_sdf, sdf.new_empty(() if need_inv_s else 0), of_cosine, of_length
+
+
+def _fake_density(density: Tensor, section_length: Tensor) -> Tensor:
+    return density.new_empty(density.shape)
+
+
+def _save_density(ctx: Any, inputs: Any, output: Any) -> None:
+    ctx.save_for_backward(*inputs)
+
+
+def _backward_density(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+    needs = ctx.needs_input_grad
+    return _wanted(torch.ops.pred.sdf_to_alpha_density_backward(grad, *ctx.saved_tensors, *needs), needs)
+
+
+def _fake_density_backward(
+    grad: Tensor, density: Tensor, section_length: Tensor, need_density: bool, need_section_length: bool
+) -> tuple[Tensor, Tensor]:
+    shapes = [density.shape if need else (0,) for need in (need_density, need_section_length)]
+    return density.new_empty(shapes[0]), density.new_empty(shapes[1])
 
 
 _native.register("sdf_to_alpha", fake=_fake, setup_context=_save, backward=_backward)
 _native.register("sdf_to_alpha_backward", fake=_fake_backward)
+_native.register("sdf_to_alpha_section", fake=_fake_section, setup_context=_save_section, backward=_backward_section)
+_native.register("sdf_to_alpha_section_backward", fake=_fake_section_backward)
+_native.register("sdf_to_alpha_density", fake=_fake_density, setup_context=_save_density, backward=_backward_density)
+_native.register("sdf_to_alpha_density_backward", fake=_fake_density_backward)

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import check_choice, check_dtype, check_shape, widen
-from pred.ops._clouds import STORAGE
+from pred.ops._check import FLOATING, HALF, check_choice, check_dtype, check_shape, check_tensors, widen
 
 
 def segment_reduce(
@@ -71,10 +70,11 @@ def segment_reduce_reference(
 
 def _arguments(features: Tensor, index: Tensor, num_segments: int, reduce: str) -> Tensor:
     op = "segment_reduce"
+    check_tensors(op, features=features, index=index)
     features = widen(features)
     check_shape(op, "features", features, ("N", "C"))
     check_shape(op, "index", index, (features.shape[0],), " as features")
-    check_dtype(op, "features", features, STORAGE)
+    check_dtype(op, "features", features, FLOATING + HALF)
     check_dtype(op, "index", index, (torch.int64,))
     check_choice(op, "reduce", reduce, ("sum", "mean", "max"))
     if index.device != features.device:

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import check_dtype
-from pred.ops._clouds import STORAGE, check_offsets
+from pred.ops._check import FLOATING, HALF, check_dtype, check_offsets, check_tensors
 
 _MAX_KEYS = 2**62
 _MAX_CELLS = 2**30
@@ -99,10 +98,11 @@ def check_voxelize_arguments(
     point_range: Sequence[float],
 ) -> tuple[list[float], list[float], list[int]]:
     """Voxel size, range and grid size (x, y, z) after all checks."""
+    check_tensors(op, points=points, batch_offsets=batch_offsets)
     if points.dim() != 2 or points.shape[1] < 3:
         raise ValueError(f"{op}: points must have shape [N, D] with D >= 3, got {list(points.shape)}")
-    check_dtype(op, "points", points, STORAGE)
-    check_offsets(op, "batch_offsets", batch_offsets, "N", points.shape[0], "points", points)
+    check_dtype(op, "points", points, FLOATING + HALF)
+    check_offsets(op, "batch_offsets", batch_offsets, "BN", "points", points)
     size, bounds = _floats(op, "voxel_size", voxel_size, 3), _floats(op, "point_range", point_range, 6)
     grid = _grid_size(op, size, bounds)
     frame_keys = math.prod([1 << (cells - 1).bit_length() for cells in grid])

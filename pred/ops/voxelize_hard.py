@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import widen
+from pred.ops._check import check_tensors, widen
 from pred.ops.voxelize import check_voxelize_arguments, voxelize_reference
 
 
@@ -64,6 +64,7 @@ def voxelize_hard(
     ``voxels`` is differentiable in ``points`` any number of times: a kept point takes the gradient of its row, a
     dropped one 0. Equal bits for any thread count and instruction set.
     """
+    check_tensors("voxelize_hard", points=points, batch_offsets=batch_offsets)
     points = widen(points)
     size, bounds, grid = check_voxelize_arguments("voxelize_hard", points, batch_offsets, voxel_size, point_range)
     for name, limit in (("max_points", max_points), ("max_voxels", max_voxels)):

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pred.ops import composite_rays, reference
+from pred.ops import Composite, composite_rays, reference
 from tests.tolerances import FORWARD, GRADIENT, assert_close
 
 OUTPUTS = ("weights", "depth", "opacity", "values")
@@ -47,6 +47,11 @@ def results(
     return {name: value.detach() for name, value in found.items()}
 
 
+def depth(out: Composite) -> Tensor:
+    assert out.depth is not None
+    return out.depth
+
+
 def test_hand_computed(backend: str) -> None:
     # s = 1: Phi = 0.7310586, 0.5, 0.2689414. Weights telescope: w_0 = w_1 = 0.2310586 / 0.7310586, and 1 / e is left.
     sdf = torch.tensor([[1.0, 0.0, -1.0]], dtype=torch.float64, requires_grad=True)
@@ -56,21 +61,21 @@ def test_hand_computed(backend: str) -> None:
     out = composite_rays(sdf, 1.0, t, values)
     assert out.weights[0].tolist() == pytest.approx([w, w, 0.0], abs=1e-10)
     assert out.opacity.item() == pytest.approx(1 - rest)
-    assert out.depth.item() == pytest.approx(6 * w)
+    assert depth(out).item() == pytest.approx(6 * w)
     assert out.values is not None and out.values[0].tolist() == pytest.approx([w, w, 0.0], abs=1e-10)
     # opacity = 1 - Phi(d_2) / Phi(d_0), whose derivatives are those of Phi.
     grads = torch.autograd.grad(out.opacity, sdf)[0][0].tolist()
     assert grads == pytest.approx([0.26894142 * 0.19661193 / 0.53444665, 0.0, -0.19661193 / 0.73105858], abs=1e-7)
-    (grad_t,) = torch.autograd.grad(composite_rays(sdf, 1.0, t).depth, t)
+    (grad_t,) = torch.autograd.grad(depth(composite_rays(sdf, 1.0, t)), t)
     assert grad_t[0].tolist() == pytest.approx([w, w, 0.0], abs=1e-10)
     # The middles of the sections are 3 and 6.
-    assert composite_rays(sdf, 1.0, t, depth_at="mid").depth.item() == pytest.approx(9 * w)
-    assert composite_rays(sdf, 1.0, t, normalize_depth=True).depth.item() == pytest.approx(3.0)
+    assert depth(composite_rays(sdf, 1.0, t, depth_at="mid")).item() == pytest.approx(9 * w)
+    assert depth(composite_rays(sdf, 1.0, t, normalize_depth=True)).item() == pytest.approx(3.0)
     opaque = composite_rays(sdf, 1.0, t, values, last="opaque")
     assert opaque.weights[0].tolist() == pytest.approx([w, w, rest])
     assert opaque.opacity.item() == pytest.approx(1.0)
-    assert opaque.depth.item() == pytest.approx(6 * w + 8 * rest)
-    assert composite_rays(sdf, 1.0, t, depth_at="mid", last="opaque").depth.item() == pytest.approx(9 * w + 8 * rest)
+    assert depth(opaque).item() == pytest.approx(6 * w + 8 * rest)
+    assert depth(composite_rays(sdf, 1.0, t, depth_at="mid", last="opaque")).item() == pytest.approx(9 * w + 8 * rest)
 
 
 def test_opaque_sample_has_the_right_gradient(backend: str) -> None:
@@ -114,7 +119,7 @@ def test_free_space_is_empty(backend: str) -> None:
     """223 samples of s d >> 1 add up to nothing: no phantom opacity that fogs the depth behind it."""
     sdf = torch.linspace(30, 2, 224)[None]
     out = composite_rays(sdf, 64.0, torch.linspace(1, 50, 224)[None])
-    assert out.opacity.item() < 1e-30 and out.depth.item() < 1e-28
+    assert out.opacity.item() < 1e-30 and depth(out).item() < 1e-28
 
 
 def test_transmittance_underflow(backend: str) -> None:
@@ -123,7 +128,7 @@ def test_transmittance_underflow(backend: str) -> None:
     sdf.requires_grad_()
     out = composite_rays(sdf, 64.0, torch.linspace(1, 50, 400)[None])
     assert out.opacity.item() == pytest.approx(1.0, abs=1e-6)
-    out.depth.sum().backward()
+    depth(out).sum().backward()
     assert sdf.grad is not None and sdf.grad.isfinite().all()
 
 
@@ -164,6 +169,7 @@ def test_without_values(native: None) -> None:
     out, expected = composite_rays(sdf, inv_s, t), reference.composite_rays(sdf, inv_s, t)
     assert out.values is None and expected.values is None
     for actual, wanted in zip(out[:3], expected[:3], strict=True):
+        assert actual is not None and wanted is not None
         assert_close(actual, wanted, FORWARD[torch.float64])
 
 
@@ -217,41 +223,41 @@ def test_detached_distance(backend: str) -> None:
     sdf, inv_s, t, values = (tensor.requires_grad_() for tensor in case())
     out = composite_rays(sdf, inv_s, t, values, detach_sdf=True)
     assert out.values is not None
-    total = out.values.sum() + out.depth.sum()
+    total = out.values.sum() + depth(out).sum()
     grads = torch.autograd.grad(total, (sdf, inv_s, t, values), allow_unused=True)
     assert grads[0] is None and grads[1] is None
     assert grads[2] is not None and grads[3] is not None
     full = composite_rays(sdf, inv_s, t, values)
     assert full.values is not None
-    expected = torch.autograd.grad(full.values.sum() + full.depth.sum(), (t, values))
+    expected = torch.autograd.grad(full.values.sum() + depth(full).sum(), (t, values))
     assert_close(grads[2], expected[0], 1e-14)
     assert_close(grads[3], expected[1], 1e-14)
     kept = composite_rays(sdf, inv_s, t, detach_sdf=True, detach_inv_s=False)
-    of_sdf, of_inv_s = torch.autograd.grad(kept.depth.sum(), (sdf, inv_s), allow_unused=True)
+    of_sdf, of_inv_s = torch.autograd.grad(depth(kept).sum(), (sdf, inv_s), allow_unused=True)
     assert of_sdf is None and of_inv_s is not None and of_inv_s != 0
 
 
 @pytest.mark.parametrize("num_rays", [0, 3])
 def test_opcheck(native: None, num_rays: int) -> None:
     sdf, inv_s, t, values = (tensor.float().requires_grad_() for tensor in case(num_rays, 9, 3))
-    torch.library.opcheck(torch.ops.pred.composite_rays.default, (sdf, inv_s, t, values, False, False))
-    torch.library.opcheck(torch.ops.pred.composite_rays.default, (sdf, inv_s, t, None, True, True))
+    torch.library.opcheck(torch.ops.pred.composite_rays.default, (sdf, inv_s, t, values, None, False, False))
+    torch.library.opcheck(torch.ops.pred.composite_rays.default, (sdf, inv_s, t, None, None, True, True))
     plain = [tensor.detach() for tensor in (sdf, inv_s, t, values)]
     grads = [torch.randn(num_rays, 9), torch.randn(num_rays), torch.randn(num_rays), torch.randn(num_rays, 3)]
-    weights, _, _, _, remaining = torch.ops.pred.composite_rays(*plain, False, False)
+    weights, _, _, _, remaining = torch.ops.pred.composite_rays(*plain, None, False, False)
     backward = torch.ops.pred.composite_rays_backward.default
     for needs in [(True, True, True, True), (False, False, False, True)]:
-        torch.library.opcheck(backward, (*grads, *plain, weights, remaining, False, False, *needs))
+        torch.library.opcheck(backward, (*grads, *plain, None, weights, remaining, False, False, *needs))
     of_depth = (None, grads[1], None, None)
     torch.library.opcheck(
-        backward, (*of_depth, *plain[:3], None, weights, remaining, True, True, True, False, True, False)
+        backward, (*of_depth, *plain[:3], None, None, weights, remaining, True, True, True, False, True, False)
     )
 
 
 def test_further_derivative_is_refused(native: None) -> None:
     sdf, inv_s, t, values = case()
     sdf.requires_grad_()
-    (first,) = torch.autograd.grad(composite_rays(sdf, inv_s, t).depth.sum(), sdf, create_graph=True)
+    (first,) = torch.autograd.grad(depth(composite_rays(sdf, inv_s, t)).sum(), sdf, create_graph=True)
     with pytest.raises(RuntimeError, match="composite_rays_backward: a further derivative"):
         first.square().sum().backward()
 
@@ -262,7 +268,7 @@ def test_compiles_to_one_graph(backend: str) -> None:
     def loss(*x: Tensor) -> Tensor:
         out = composite_rays(*x)
         assert out.values is not None
-        return out.depth.sum() + out.values.square().sum()
+        return depth(out).sum() + out.values.square().sum()
 
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
     for actual, expected in zip(

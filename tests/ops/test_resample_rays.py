@@ -196,11 +196,12 @@ def test_carries_no_gradient(backend: str) -> None:
     assert not resample_rays(t, weights, 5).requires_grad
 
 
+@pytest.mark.parametrize("mode", ["exact", "neus", "nerfstudio"])
 @pytest.mark.parametrize("num_rays", [0, 3])
-def test_opcheck(native: None, num_rays: int) -> None:
+def test_opcheck(native: None, num_rays: int, mode: str) -> None:
     t, weights = case(num_rays, 10, torch.float32)
     u = (torch.arange(5) + 0.5) / 5
-    torch.library.opcheck(torch.ops.pred.resample_rays.default, (t, weights, u))
+    torch.library.opcheck(torch.ops.pred.resample_rays.default, (t, weights, u, mode, 0.01, 1e-5, 0.0))
     assert resample_rays(t, weights, 5).shape == (num_rays, 15)
 
 

@@ -1,0 +1,92 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""Other libraries that do an op's work on the CPU, for `Case.peers`.
+
+Each function gives name -> factory; the factory imports its library, so that a missing one only leaves a row out. Peers
+use the threads they use: "cores busy" in the tables shows how many (spconv's and mmcv's voxels: one).
+
+* spconv 2.x ``PointToVoxel`` and mmcv's ``Voxelization`` (full build, with compiled ops): `voxelize_hard`
+* torch-scatter ``scatter``: `segment_reduce`
+* nerfacc ``render_weight_from_alpha`` and ``accumulate_along_rays`` on dense rays: compositing. Its
+  ``importance_sampling`` runs on CUDA only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from benchmarks.case import Function, Variant
+
+Peers = Mapping[str, Callable[[], Variant]]
+
+
+def segment_reduce(num_segments: int, reduce: str) -> Peers:
+    """For inputs ``(features, index)`` in which no index is -1."""
+
+    def torch_scatter() -> Variant:
+        from torch_scatter import scatter
+
+        return Variant(lambda features, index: (scatter(features, index, 0, None, num_segments, reduce),))
+
+    return {"torch-scatter": torch_scatter}
+
+
+def composite(alpha: Callable[..., Tensor]) -> Peers:
+    """For inputs ``(sdf, inv_s, t[, values])`` and the results weights, depth, opacity and values.
+
+    Args:
+        alpha: opacities ``[R, S]`` from ``sdf`` and ``inv_s``, in plain PyTorch; nerfacc starts from there.
+    """
+
+    def nerfacc() -> Variant:
+        from nerfacc import accumulate_along_rays, render_weight_from_alpha
+
+        def render(sdf: Tensor, inv_s: Tensor, t: Tensor, values: Tensor | None = None) -> tuple[Tensor, ...]:
+            weights, _ = render_weight_from_alpha(alpha(sdf, inv_s))
+            depth = accumulate_along_rays(weights, t[..., None])[:, 0]
+            opacity = accumulate_along_rays(weights)[:, 0]
+            sums = weights, depth, opacity
+            return sums if values is None else (*sums, accumulate_along_rays(weights, values))
+
+        return Variant(render)
+
+    return {"nerfacc": nerfacc}
+
+
+def voxelize_hard(
+    channels: int, voxel_size: Sequence[float], point_range: Sequence[float], max_points: int, max_voxels: int
+) -> Peers:
+    """For inputs ``(points, batch_offsets)`` of one frame, and the results voxels, coords and counts."""
+    size, bounds = list(voxel_size), list(point_range)
+
+    def spconv() -> Variant:
+        from spconv.pytorch.utils import PointToVoxel
+
+        make_voxels = PointToVoxel(size, bounds, channels, max_voxels, max_points)
+        return Variant(_of_one_frame(make_voxels), as_ours=_with_frame)
+
+    def mmcv() -> Variant:
+        from mmcv.ops import Voxelization
+
+        make_voxels = Voxelization(size, bounds, max_points, max_voxels)
+        return Variant(_of_one_frame(make_voxels.eval()), as_ours=_with_frame)
+
+    return {"spconv": spconv, "mmcv": mmcv}
+
+
+def _of_one_frame(make_voxels: Callable[[Tensor], Sequence[Tensor]]) -> Function:
+    def run(points: Tensor, batch_offsets: Tensor) -> tuple[Tensor, ...]:
+        if len(batch_offsets) != 2:
+            raise ValueError(f"a peer takes one frame at a time, got {len(batch_offsets) - 1}")
+        return tuple(make_voxels(points))
+
+    return run
+
+
+def _with_frame(results: list[Tensor]) -> list[Tensor]:
+    """Voxels, (z, y, x) and counts with the frame's number before each coordinate, as int64."""
+    voxels, coords, counts = results
+    return [voxels, torch.nn.functional.pad(coords.long(), (1, 0)), counts.long()]

@@ -1,0 +1,212 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// What sample_pdf and resample_rays share: the cumulative distribution of a ray's weights, and its inverse. CPU kernels
+// only.
+#pragma once
+
+#include "math/lanes.h"
+#include "ops/sample_pdf.h"
+
+namespace pred::PRED_ISA {
+namespace {
+
+constexpr int64_t kPad = 16;  // at least a vector, on both sides of every row
+
+static inline int64_t padded(int64_t n) { return (n + kPad - 1) / kPad * kPad; }
+
+// `narrowest`: a section less probable counts as empty, so that slopes stay finite.
+template <typename T>
+struct Limits;
+template <>
+struct Limits<float> {
+  static constexpr float smallest = __FLT_MIN__, largest = __FLT_MAX__, below_one = 1.0f - __FLT_EPSILON__ / 2;
+  static constexpr float narrowest = 1e-30f;
+};
+template <>
+struct Limits<double> {
+  static constexpr double smallest = __DBL_MIN__, largest = __DBL_MAX__, below_one = 1.0 - __DBL_EPSILON__ / 2;
+  static constexpr double narrowest = 1e-300;
+};
+
+// Scratch rows of one ray, with room for a vector on both sides. Sections are padded to whole vectors, by empty ones
+// at the end.
+template <typename T>
+struct Row {
+  int64_t sections, size;  // size: padded
+  T *t, *mass, *cdf, *slope, *u, *out;
+  int32_t *low, *high;  // [size + num_new] each, at least
+};
+
+// For `num_out` elements of `out`.
+template <typename T>
+static int64_t row_scratch_size(int64_t num_samples, int64_t num_new, int64_t num_out) {
+  return 4 * (padded(num_samples) + 2 * kPad) + (num_new + 2 * kPad) + (num_out + 3 * kPad);
+}
+
+static int64_t row_int_scratch_size(int64_t num_samples, int64_t num_new) {
+  return 2 * (padded(num_samples) + num_new + kPad);
+}
+
+template <typename T>
+static Row<T> make_row(int64_t num_samples, int64_t num_new, T* scratch, int32_t* int_scratch) {
+  const int64_t sections = num_samples - 1, size = padded(sections), stride = size + 2 * kPad;
+  T* first = scratch + kPad;
+  T* u = first + 4 * stride;
+  first[3 * stride + size] = T(0);  // the slope behind the last section
+  return {sections,
+          size,
+          first,
+          first + stride,
+          first + 2 * stride,
+          first + 3 * stride,
+          u,
+          u + num_new + kPad,
+          int_scratch,
+          int_scratch + padded(num_samples) + num_new + kPad};
+}
+
+// To [0, 1); keeps NaN.
+template <typename T>
+static inline T clip_position(T u) {
+  const T low = u < T(0) ? T(0) : u;
+  return low > Limits<T>::below_one ? Limits<T>::below_one : low;
+}
+
+template <typename T>
+static inline bool ascending(const T* x, int64_t n) {
+  int32_t out_of_order = 0;
+  for (int64_t i = 0; i + 1 < n; ++i) out_of_order |= x[i] <= x[i + 1] ? 0 : 1;
+  return out_of_order == 0;  // false for NaN
+}
+
+// cumulative[i] = sum of mass[0..i), for i in [0, n]; summed in double.
+template <typename T>
+static inline void accumulate(const T* mass, int64_t n, T* cumulative) {
+  constexpr int D = kWidth<double>;
+  Vec<double, D> before{};
+  cumulative[0] = T(0);
+  for (int64_t i = 0; i < n; i += D) {
+    const Vec<double, D> sums = prefix_sum<double, D>(load_wide(mass + i));
+    store_narrow(cumulative + i + 1, before + sums);
+    before += broadcast<D - 1, double, D>(sums);
+  }
+}
+
+template <typename T>
+static inline void read_ranges(const T* __restrict t, const Row<T>& row) {
+  for (int64_t i = 0; i <= row.sections; ++i) row.t[i] = t[i];
+  for (int64_t i = row.sections + 1; i <= row.size + 1; ++i) row.t[i] = t[row.sections];
+}
+
+// The cumulative distribution over sections, from 0 to exactly 1. False where there is none: a range is not finite.
+template <typename T>
+static inline bool distribution(const T* __restrict weights, const Row<T>& row) {
+  const T* __restrict t = row.t;
+  T* __restrict mass = row.mass;
+  T* __restrict cdf = row.cdf;
+  for (int64_t i = 0; i < row.sections; ++i) mass[i] = weights[i] <= T(0) ? T(0) : weights[i];
+  for (int64_t i = row.sections; i < row.size; ++i) mass[i] = T(0);
+  accumulate(mass, row.size, cdf);
+  T total = cdf[row.size];
+  if (!(total >= Limits<T>::smallest && total <= Limits<T>::largest)) {
+    for (int64_t i = 0; i < row.size; ++i) mass[i] = t[i + 1] - t[i] <= T(0) ? T(0) : t[i + 1] - t[i];
+    accumulate(mass, row.size, cdf);
+    total = cdf[row.size];
+    if (!(total <= Limits<T>::largest)) return false;
+    if (total == T(0)) {  // all t are equal: any section will do
+      for (int64_t i = row.sections; i <= row.size; ++i) cdf[i] = T(1);
+      return true;
+    }
+  }
+  for (int64_t i = 0; i < row.size; ++i) cdf[i] = cdf[i] / total;
+  cdf[row.size] = T(1);
+  return true;
+}
+
+// The published rules: the cumulative distribution starts at 0 and ends near 1.
+template <typename T>
+static inline void published_distribution(const PdfRule<T>& rule, const T* __restrict weights, const Row<T>& row) {
+  const bool neus = rule.mode == PdfMode::kNeus;
+  const T added = neus ? rule.eps : rule.histogram_padding;
+  T* __restrict mass = row.mass;
+  T* __restrict cdf = row.cdf;
+  for (int64_t i = 0; i < row.sections; ++i) mass[i] = weights[i] + added;
+  for (int64_t i = row.sections; i < row.size; ++i) mass[i] = T(0);
+  accumulate(mass, row.size, cdf);
+  T total = cdf[row.sections];
+  if (!neus) {
+    const T missing = rule.eps - total <= T(0) ? T(0) : rule.eps - total;
+    const T part = missing / T(row.sections);
+    for (int64_t i = 0; i < row.sections; ++i) mass[i] += part;
+    total += missing;
+  }
+  for (int64_t i = 0; i < row.sections; ++i) mass[i] = mass[i] / total;
+  accumulate(mass, row.size, cdf);
+  if (neus) return;
+  for (int64_t i = 1; i <= row.sections; ++i) cdf[i] = cdf[i] > T(1) ? T(1) : cdf[i];
+}
+
+// row.low[k] = number of entries of the cdf that are not above u_k, by bisection of all k at once: vectors of gathers,
+// where the machine has them, and no branch to mispredict. NaN, in u or in the cdf, is above nothing.
+template <typename T>
+static inline void search(int64_t num_new, const Row<T>& row) {
+  const T* __restrict cdf = row.cdf, * __restrict u = row.u;
+  int32_t* __restrict low = row.low, * __restrict high = row.high;
+  const int32_t entries = int32_t(row.sections) + 1;
+  for (int64_t k = 0; k < num_new; ++k) low[k] = 0;
+  for (int64_t k = 0; k < num_new; ++k) high[k] = entries;
+  for (int32_t left = entries; left > 0; left /= 2) {
+    for (int64_t k = 0; k < num_new; ++k) {
+      const int32_t middle = (low[k] + high[k]) >> 1;
+      const bool open = low[k] < high[k], up = !(cdf[middle] > u[k]);
+      low[k] = open && up ? middle + 1 : low[k];
+      high[k] = open && !up ? middle : high[k];
+    }
+  }
+}
+
+// Samples in the order of u, whatever that is. The cdf and u must be there.
+template <typename T>
+static inline void exact_samples(bool has_cdf, int64_t num_new, const Row<T>& row, T* __restrict samples) {
+  search(num_new, row);
+  const T* __restrict t = row.t, * __restrict cdf = row.cdf, * __restrict u = row.u;
+  const int32_t* __restrict above = row.low;
+  const int32_t last = int32_t(row.sections) - 1;
+  for (int64_t k = 0; k < num_new; ++k) {
+    const int32_t before = above[k] - 1, positive = before > 0 ? before : 0, i = positive < last ? positive : last;
+    const T width = cdf[i + 1] - cdf[i];
+    const T fraction = (u[k] - cdf[i]) / (width > T(0) ? width : T(1));
+    samples[k] = has_cdf ? t[i] + fraction * (t[i + 1] - t[i]) : T(__builtin_nan(""));
+  }
+}
+
+// 0 for NaN, and within [0, 1].
+template <typename T>
+static inline T clip_fraction(T x) {
+  const T low = x >= T(0) ? x : T(0);
+  return low > T(1) ? T(1) : low;
+}
+
+template <typename T>
+static inline void published_samples(const PdfRule<T>& rule, int64_t num_new, const Row<T>& row,
+                                     T* __restrict samples) {
+  search(num_new, row);
+  const bool neus = rule.mode == PdfMode::kNeus;
+  const T narrow = neus ? rule.eps : rule.min_width;
+  const T* __restrict t = row.t, * __restrict cdf = row.cdf, * __restrict u = row.u;
+  const int32_t* __restrict above = row.low;
+  const int32_t last = int32_t(row.sections);
+  for (int64_t k = 0; k < num_new; ++k) {
+    const int32_t low = above[k] > 1 ? above[k] - 1 : 0, high = above[k] < last ? above[k] : last;
+    const T width = cdf[high] - cdf[low];
+    const T fraction = (u[k] - cdf[low]) / (narrow > T(0) && width < narrow ? T(1) : width);
+    const T clipped = clip_fraction(fraction);
+    // With a least width nothing is divided by 0, and NaN is that of the input.
+    const T kept = neus || (narrow > T(0) && fraction != fraction) ? fraction : clipped;
+    samples[k] = t[low] + kept * (t[high] - t[low]);
+  }
+}
+
+}  // namespace
+}  // namespace pred::PRED_ISA

@@ -1,0 +1,30 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+#include "ops/sample_grid_binding.h"
+
+namespace pred {
+namespace {
+
+PRED_KERNELS_BY_STORAGE(SampleVolumeKernels, sample_volume)
+
+struct Volume {
+  static constexpr int kAxes = 3;
+  static constexpr const char* kName = "sample_volume";
+  static constexpr const char* kMap = "volume";
+  template <typename S>
+  static const SampleVolumeKernels<S>& table() {
+    return kernels<S>();
+  }
+};
+using SampleVolume = SampleGrid<Volume>;
+
+}  // namespace
+}  // namespace pred
+
+STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) {
+  m.impl("sample_volume", TORCH_BOX(&pred::SampleVolume::forward));
+  m.impl("sample_volume_backward", TORCH_BOX(&pred::SampleVolume::backward));
+  m.impl("sample_volume_double_backward", TORCH_BOX(&pred::SampleVolume::double_backward));
+  m.impl("sample_volume_with_grad", TORCH_BOX(&pred::SampleVolume::with_grad));
+  m.impl("sample_volume_with_grad_backward", TORCH_BOX(&pred::SampleVolume::with_grad_backward));
+}

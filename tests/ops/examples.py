@@ -1,0 +1,315 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""Example calls of every public op: what test_contract.py, test_properties.py and fuzz_ops.py run on.
+
+A new op is one builder and one entry (or a few) in EXAMPLES.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from pred import ops
+from pred.ops import reference
+
+HALF = (torch.bfloat16, torch.float16)
+NO_OP = {"build_info", "parallel_probe"}
+"""Registered in the library, but not for users."""
+PUBLIC = [name for name in ops.__all__ if inspect.isfunction(getattr(ops, name))]
+
+Arguments = dict[str, Any]
+
+
+class Source:
+    """Where a builder takes its numbers from.
+
+    ``count`` is the number of rays, samples or points. Sizes keep their default here; test_properties.py draws them.
+    """
+
+    def __init__(self, seed: int, count: int) -> None:
+        self.count = count
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def size(self, default: int, low: int, high: int) -> int:
+        """Any other size, in [low, high]."""
+        return default
+
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(shape, generator=self._generator, dtype=torch.float64)
+
+    def uniform(self, low: float, high: float, *shape: int) -> Tensor:
+        return torch.rand(shape, generator=self._generator, dtype=torch.float64) * (high - low) + low
+
+    def integers(self, low: int, high: int, *shape: int) -> Tensor:
+        """In [low, high); all ``low`` where that is empty."""
+        return torch.randint(low, max(high, low + 1), shape, generator=self._generator)
+
+    def offsets(self, total: int, parts: int) -> Tensor:
+        """``[parts + 1]`` int64 ascending from 0 to ``total``; some parts are empty. No parts hold nothing."""
+        if parts == 0:
+            return torch.zeros(1, dtype=torch.int64)
+        inner = self.integers(0, total + 1, parts - 1).sort().values
+        return torch.cat([torch.tensor([0]), inner, torch.tensor([total])])
+
+    def dyadic(self, low: float, high: float, *shape: int) -> Tensor:
+        """Multiples of 1/1024: times a small whole number they are exact in float32 too, so that a position falls into
+        the same cell, on the same side of a kink, in every dtype."""
+        return self.integers(round(1024 * low), round(1024 * high) + 1, *shape).double() / 1024
+
+
+@dataclass(frozen=True)
+class Example:
+    """One way to call one op."""
+
+    op: str
+    build: Callable[[Source], Arguments]
+    """Arguments by name; floating-point tensors in float64."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Further arguments; they replace those of ``build``."""
+    differentiable: tuple[str, ...] = ()
+    """Arguments with a derivative."""
+    features: tuple[str, ...] = ()
+    """Arguments that may be stored in half precision; the others are float32 then."""
+    order: int | None = 1
+    """Derivatives that the documentation promises; None: any number."""
+    tolerance: float = 1.0
+    """Factor on tolerances.py for float32, with its cause beside the entry."""
+    many: int = 4000
+    """A count that several threads share."""
+    reference_compiles: bool = True
+    """Whether torch.compile makes one graph of the reference."""
+
+    def __str__(self) -> str:
+        return "-".join([self.op, *(f"{name}={value}" for name, value in self.options.items())])
+
+    def arguments(self, source: Source, dtype: torch.dtype) -> Arguments:
+        """Arguments with geometry in ``dtype`` (float32 at least) and features in ``dtype``."""
+        geometry = torch.float32 if dtype in HALF else dtype
+        built = self.build(source) | dict(self.options)
+        return {
+            name: value.to(dtype if name in self.features else geometry)
+            if isinstance(value, Tensor) and value.is_floating_point()
+            else value
+            for name, value in built.items()
+        }
+
+    def example(self, count: int, dtype: torch.dtype = torch.float32, seed: int = 0) -> Arguments:
+        """Arguments with the default sizes."""
+        return self.arguments(Source(seed, count), dtype)
+
+    def leaves(self, arguments: Arguments) -> list[str]:
+        """Names of the arguments to differentiate."""
+        return [name for name in self.differentiable if isinstance(arguments.get(name), Tensor)]
+
+    @property
+    def native(self) -> Callable[..., Any]:
+        """The public function, which runs compiled where PRED_BACKEND says so."""
+        function: Callable[..., Any] = getattr(ops, self.op)
+        return function
+
+    @property
+    def reference(self) -> Callable[..., Any]:
+        function: Callable[..., Any] = getattr(reference, self.op)
+        return function
+
+
+def outputs(result: Any) -> dict[str, Tensor]:
+    """Result tensors by name."""
+    if isinstance(result, Tensor):
+        return {"out": result}
+    names = getattr(result, "_fields", [f"out{i}" for i in range(len(result))])
+    return {name: value for name, value in zip(names, result, strict=True) if value is not None}
+
+
+def evaluate(
+    function: Callable[..., Any], arguments: Arguments, leaves: Sequence[str], order: int = 1
+) -> dict[str, Tensor]:
+    """Outputs and, up to ``order`` 2, derivatives with fixed cotangents: ``grad_<argument>`` of the outputs, and
+    ``second_<argument>`` of the squared gradients, also in the cotangents. Strides of the arguments are kept."""
+    held = {name: arguments[name].detach().requires_grad_(order > 0) for name in leaves}
+    out = outputs(function(**(arguments | held)))
+    found = {name: value.detach() for name, value in out.items()}
+    targets = {name: value for name, value in out.items() if value.requires_grad}
+    if order == 0 or not targets:
+        return found
+    cotangents = {
+        # float32 values in every dtype, so that all dtypes compute the same thing
+        name: torch.linspace(-1, 2, value.numel()).reshape(value.shape).to(value.dtype).requires_grad_(order > 1)
+        for name, value in targets.items()
+    }
+    # Where an output does not depend on an argument, torch says None; here, and in what follows, that is 0.
+    first = grads(list(targets.values()), list(held.values()), list(cotangents.values()), create_graph=order > 1)
+    found |= {f"grad_{name}": grad.detach() for name, grad in zip(held, first, strict=True)}
+    curved = [grad for grad in first if grad.requires_grad]
+    if order > 1 and curved:
+        inputs = {f"cotangent_{name}": value for name, value in cotangents.items()} | held
+        second = grads([grad.square().sum() for grad in curved], list(inputs.values()))
+        found |= {f"second_{name}": grad for name, grad in zip(inputs, second, strict=True)}
+    return found
+
+
+def grads(
+    values: list[Tensor], inputs: list[Tensor], cotangents: list[Tensor] | None = None, create_graph: bool = False
+) -> list[Tensor]:
+    """torch.autograd.grad with zeros where there is no dependence."""
+    found = torch.autograd.grad(values, inputs, cotangents, create_graph=create_graph, allow_unused=True)
+    return [torch.zeros_like(x) if grad is None else grad for x, grad in zip(inputs, found, strict=True)]
+
+
+def order_of(example: Example) -> int:
+    """Derivatives to compute; second ones stand for any number."""
+    return 2 if example.order is None else example.order
+
+
+def _sample_bev(source: Source) -> Arguments:
+    batch, channels = source.size(2, 0, 3), source.size(5, 0, 70)
+    return {
+        "bev": source.normal(batch, channels, source.size(7, 1, 20), source.size(6, 1, 20)),
+        "grid": source.dyadic(-1.3, 1.3, batch, source.count, 2),
+    }
+
+
+def _segment_reduce(source: Source) -> Arguments:
+    segments = source.size(50, 1, 90)
+    return {
+        "features": source.normal(source.count, source.size(19, 0, 70)),
+        "index": source.integers(-1, segments, source.count),
+        "num_segments": segments,
+    }
+
+
+def _voxelize(source: Source) -> Arguments:
+    points = source.uniform(-5, 45, source.count, source.size(4, 3, 6))
+    return {
+        "points": points,
+        "batch_offsets": source.offsets(source.count, source.size(3, 1, 5)),
+        "voxel_size": (0.5, 0.25, 8.0),
+        "point_range": (0.0, 0.0, 0.0, 40.0, 40.0, 40.0),
+    }
+
+
+def _rays(source: Source) -> Arguments:
+    """Rays through soft surfaces, some of which they leave again."""
+    rays, samples = source.count, source.size(33, 0, 70)
+    t = source.uniform(0, 1, rays, samples).cumsum(dim=1) + 1
+    surface = source.uniform(2, 12, rays, 1)
+    sdf = surface - 0.8 * t + 0.4 * source.normal(rays, samples)
+    return {"sdf": sdf, "inv_s": source.uniform(1, 5, 1)[0], "t": t}
+
+
+def _sdf_to_alpha(source: Source) -> Arguments:
+    rays = _rays(source)
+    return {"sdf": rays["sdf"], "inv_s": rays["inv_s"]}
+
+
+def _composite_rays(source: Source) -> Arguments:
+    rays = _rays(source)
+    return rays | {"values": source.normal(*rays["sdf"].shape, source.size(4, 0, 40))}
+
+
+def _resample_rays(source: Source) -> Arguments:
+    samples, new = source.size(24, 2, 70), source.size(17, 0, 70)
+    t = source.uniform(0.1, 1, source.count, samples).cumsum(dim=1) + 1
+    # No section is nearly empty: in one, a rounding of u moves the sample by 1e-7 / weight.
+    weights = source.uniform(0.2, 1, source.count, samples)
+    return {"t": t, "weights": weights, "num_samples": new, "u": source.uniform(0, 1, source.count, new)}
+
+
+def _examples(op: str, build: Callable[[Source], Arguments], *options: Arguments, **fields: Any) -> list[Example]:
+    return [Example(op, build, chosen, **fields) for chosen in options or ({},)]
+
+
+EXAMPLES = [
+    *_examples(
+        "sample_bev",
+        _sample_bev,
+        *(
+            {"padding_mode": mode, "align_corners": corners}
+            for mode in ("zeros", "border")
+            for corners in (False, True)
+        ),
+        differentiable=("bev", "grid"),
+        order=2,
+        # Positions are rounded to float32 before they are scaled to cells: 1e-7 of the map's width.
+        tolerance=4,
+    ),
+    *_examples(
+        "segment_reduce",
+        _segment_reduce,
+        *({"reduce": reduce} for reduce in ("sum", "mean", "max")),
+        differentiable=("features",),
+        order=None,
+        # A sum of n rows carries the rounding of n additions.
+        tolerance=4,
+        many=20000,
+    ),
+    *_examples("voxelize", _voxelize, order=0, many=70000, reference_compiles=False),
+    *_examples("sdf_to_alpha", _sdf_to_alpha, {}, {"last": "opaque"}, {"inv_s": 2.7}, differentiable=("sdf", "inv_s")),
+    *_examples(
+        "composite_rays",
+        _composite_rays,
+        {},
+        {"depth_at": "mid", "last": "opaque", "normalize_depth": True},
+        {"values": None},
+        {"detach_sdf": True},
+        {"detach_sdf": True, "detach_inv_s": False},
+        differentiable=("sdf", "inv_s", "t", "values"),
+        # Up to 70 samples are multiplied along a ray.
+        tolerance=3,
+    ),
+    *_examples(
+        "resample_rays",
+        _resample_rays,
+        {},
+        {"u": None},
+        order=0,
+        # A rounding of the cumulative distribution moves a sample by 1e-7 / weight along its section.
+        tolerance=20,
+    ),
+]
+
+
+class Recorder(TorchDispatchMode):
+    """Keeps the arguments of every ``torch.ops.pred`` call, once per op and kind of arguments."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: dict[str, dict[Any, tuple[Any, ...]]] = defaultdict(dict)
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func.namespace == "pred":
+            assert not kwargs
+            kind = tuple(
+                (value.dim(), value.dtype, value.numel() == 0) if isinstance(value, Tensor) else repr(value)
+                for value in args
+            )
+            if kind not in self.calls[func._opname]:
+                plain = tuple(value.detach().clone() if isinstance(value, Tensor) else value for value in args)
+                self.calls[func._opname][kind] = plain
+        return func(*args, **(kwargs or {}))
+
+
+def recorded_calls() -> dict[str, list[tuple[Any, ...]]]:
+    """Calls of every ``torch.ops.pred`` op that the examples and their derivatives make."""
+    recorder = Recorder()
+    for example in EXAMPLES:
+        for count in (0, 5):
+            for dtype in (torch.float32, *(HALF[:1] if example.features else ())):
+                arguments = example.example(count, dtype)
+                with recorder:
+                    evaluate(example.native, arguments, example.leaves(arguments), order_of(example))
+    return {name: list(calls.values()) for name, calls in recorder.calls.items()}
+
+
+def registered_ops() -> list[str]:
+    """Names in the library ``pred``, as the dispatcher knows them."""
+    names = [name.removeprefix("pred::") for name in torch._C._dispatch_get_all_op_names() if name.startswith("pred::")]
+    return sorted(set(names) - NO_OP)
