@@ -4,7 +4,10 @@
 #   make demo      set up, pre-train a small model on the embedded street, draw pictures
 #   make test      set up, run all tests
 #   make sanitize  run the op tests under the address and undefined-behaviour sanitizers
+#   make fuzz      random arguments for every op under the sanitizers, for MINUTES
+#   make wheel-check  the op tests of one wheel under other versions of torch (downloads gigabytes)
 #   make lint      ruff, clang-format, mypy
+#   make docs      the documentation site, in build/site
 #   make bench     the benchmark suite
 #   make format    rewrite files as lint wants them
 #
@@ -13,6 +16,11 @@ PYTHON ?= python3
 TORCH ?= 2.13.0
 VENV ?= .venv
 RUN ?= runs/demo
+MINUTES ?= 60
+SEED ?= 0
+# What wheel-check runs under: version of torch (or newest), colon, Python.
+WHEEL_PYTHON ?= $(or $(shell python3.12 -c "import sys; print(sys.executable)" 2>/dev/null),$(PYTHON))
+WHEEL_CHECKS ?= 2.11.0:$(WHEEL_PYTHON) newest:$(WHEEL_PYTHON)
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
@@ -20,7 +28,7 @@ NATIVE := $(shell find csrc -type f) CMakeLists.txt setup.py
 # What nuscenes-devkit imports when its tables and geometry are used; its numpy<2 pin is left aside.
 DEVKIT := cachetools matplotlib opencv-python-headless pyquaternion scikit-learn tqdm
 
-.PHONY: demo test sanitize lint format bench clean
+.PHONY: demo test sanitized sanitize fuzz wheel-check lint format docs bench clean
 .DELETE_ON_ERROR:
 
 $(VENV)/torch-$(TORCH).stamp:
@@ -52,15 +60,30 @@ test: $(VENV)/dev.stamp
 	PRED_REQUIRE_NATIVE=1 $(BIN)/python -m pytest
 
 # A second copy of the package, built with the sanitizers, shadows the installed one. Leaks are not looked for: Python
-# itself holds memory until it exits.
+# itself holds memory until it exits. Sizes that do not fit are refused, as without sanitizers.
 SANITIZE := $(CURDIR)/build/sanitize
-sanitize: $(VENV)/dev.stamp
+SANITIZED = PRED_TEST_SANITIZED=1 PRED_REQUIRE_NATIVE=1 \
+	ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1:max_allocation_size_mb=4096 \
+	LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so):$$($(CXX) -print-file-name=libubsan.so)"
+sanitized: $(VENV)/dev.stamp
 	rm -rf $(SANITIZE)
 	PRED_SANITIZE=address,undefined PRED_REQUIRE_NATIVE=1 $(PIP) install --no-deps --no-build-isolation --target $(SANITIZE) .
-	PYTHONPATH=$(SANITIZE) PRED_TEST_SANITIZED=1 PRED_REQUIRE_NATIVE=1 ASAN_OPTIONS=detect_leaks=0 \
-		LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so):$$($(CXX) -print-file-name=libubsan.so)" \
-		$(BIN)/python -m pytest -p no:cacheprovider -o pythonpath="$(SANITIZE) ." \
+
+sanitize: sanitized
+	PYTHONPATH=$(SANITIZE) $(SANITIZED) $(BIN)/python -m pytest -p no:cacheprovider -o pythonpath="$(SANITIZE) ." \
 		tests/ops tests/test_native.py tests/data/test_sweeps.py
+
+# From another folder, since python -m puts the working one, with its pred/, first on the path.
+fuzz: sanitized
+	cd build && PYTHONPATH=$(SANITIZE):$(CURDIR) $(SANITIZED) $(abspath $(BIN))/python -m tests.fuzz_ops \
+		--minutes $(MINUTES) --seed $(SEED) --findings $(CURDIR)/build/fuzz_findings.txt
+
+wheel-check: $(VENV)/dev.stamp
+	$(BIN)/python tests/wheel_check.py $(WHEEL_CHECKS)
+
+docs: $(VENV)/native.stamp
+	PRED_REQUIRE_NATIVE=1 $(PIP) install --no-build-isolation -e ".[docs]"
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .

@@ -34,9 +34,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from benchmarks import cases
+from benchmarks.allocator import current_allocator, enter_allocator
 from benchmarks.bench_ops import first_line, missing_kernel
 from benchmarks.cases import SIZES, Sizes
-from benchmarks.measure import current_allocator, enter_allocator, time_interleaved
+from benchmarks.measure import time_interleaved
 from benchmarks.memory import added_peak_bytes
 from benchmarks.phases import compiled
 from benchmarks.report import Row, Target

@@ -89,6 +89,16 @@ class RaySamples(NamedTuple):
     values: Tensor  # [R, S, K], class probabilities
 
 
+class PackedRaySamples(NamedTuple):
+    """Inputs of packed `composite_rays`: `RaySamples` of rays of different lengths, end to end."""
+
+    sdf: Tensor  # [P]
+    inv_s: Tensor  # []
+    t: Tensor  # [P]
+    ray_offsets: Tensor  # [R + 1]
+    values: Tensor  # [P, K]
+
+
 class CoarseRays(NamedTuple):
     """Inputs of `resample_rays`."""
 
@@ -156,6 +166,16 @@ def ray_samples(sizes: Sizes, seed: int = 0) -> RaySamples:
     sdf = _sdf_m(t, surface_m, generator)
     logits = torch.randn(*t.shape, sizes.classes, generator=generator)
     return RaySamples(sdf, torch.tensor(INV_S_PER_M), t, logits.softmax(dim=-1))
+
+
+def packed_ray_samples(sizes: Sizes, seed: int = 0) -> PackedRaySamples:
+    """`ray_samples`, of which each ray keeps between an eighth and all, as where it leaves the range box."""
+    sdf, inv_s, t, values = ray_samples(sizes, seed)
+    rays, samples = sdf.shape
+    counts = torch.randint(samples // 8, samples + 1, (rays,), generator=_generator(seed))
+    kept = torch.arange(samples) < counts[:, None]
+    offsets = torch.nn.functional.pad(counts.cumsum(dim=0), (1, 0))
+    return PackedRaySamples(sdf[kept], inv_s, t[kept], offsets, values[kept])
 
 
 def coarse_rays(sizes: Sizes, seed: int = 0) -> CoarseRays:

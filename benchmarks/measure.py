@@ -1,6 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""How things are measured: interleaved timing, the machine's ceilings, allocator, and what is written down about it."""
+"""How things are measured: interleaved timing, the machine's ceilings, and what is written down about it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import platform
 import resource
 import statistics
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -23,42 +22,11 @@ from torch.utils.benchmark import Timer
 import pred
 from pred._native import native_status
 
-_ALLOCATOR_MARK = "PRED_BENCHMARK_ALLOCATOR"
-_ALLOCATOR_VARIABLES = ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
-_ALLOCATOR_LIMIT_BYTES = 4 << 30
-
 ROUNDS = 5
 COPY_BYTES = 256 << 20
 MATRIX_SIZE = 256
 SLOW_CALL_S = 0.3
 RESULTS = "benchmarks/results"  # files of earlier runs do not make the sources differ from their commit
-
-
-def enter_allocator(allocator: str) -> None:
-    """Makes this process run under an allocator setting, by starting the interpreter anew where it does not yet.
-
-    glibc serves blocks of more than 32 MB from fresh pages, and gives freed memory at the heap's end back to the
-    system. A large output then costs page faults, which say nothing about a kernel. ``raised`` lifts both thresholds
-    out of the way; ``default`` leaves the C library as it is. They are read at process start only.
-    """
-    if current_allocator() == allocator:
-        return
-    os.environ[_ALLOCATOR_MARK] = allocator
-    # torch.compile's idle compile workers would share the cores with what is timed.
-    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
-    for variable in _ALLOCATOR_VARIABLES:
-        if allocator == "raised":
-            os.environ[variable] = str(_ALLOCATOR_LIMIT_BYTES)
-        else:
-            os.environ.pop(variable, None)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
-
-
-def current_allocator() -> str | None:
-    """What `enter_allocator` set up for this process or one that started it; None: nothing yet."""
-    return os.environ.get(_ALLOCATOR_MARK)
 
 
 @dataclass(frozen=True)
@@ -138,12 +106,13 @@ def _time_block(run: Callable[[], object], threads: int, min_time_s: float) -> _
     torch.set_num_threads(threads)
     if isinstance(run, Run) and run.before is not None:
         return _time_prepared_block(run.before, run.call, min_time_s)
+    call = run.call if isinstance(run, Run) else run
     calls = 0
 
     def counted() -> None:
         nonlocal calls
         calls += 1
-        run()
+        call()
 
     faults = _page_faults()
     processor_time, start_time = time.process_time(), time.perf_counter()

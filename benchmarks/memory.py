@@ -10,7 +10,6 @@ system (``malloc_trim``, all arenas). Known sizes come out to within 0.02 MB, un
 from __future__ import annotations
 
 import ctypes
-import gc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,7 +20,6 @@ def added_peak_bytes(run: Callable[[], object]) -> int | None:
     What the call returns counts, its inputs do not. Blocks that a library keeps from its first call on (compiled
     graphs, oneDNN's scratch) do not count either if the function was called before.
     """
-    gc.collect()
     before = _reset_peak()
     result = run()
     if before is None:

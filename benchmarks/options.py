@@ -56,6 +56,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         description="Times the ops and the rendering step; prints tables, writes JSON, Markdown and a picture.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,  # `__main__` looks for --default-allocator before this parser does
     )
     what = parser.add_argument_group("what is run")
     what.add_argument("--ops", type=_list_of(OPS), default=list(OPS), help=f"some of {','.join(OPS)}")

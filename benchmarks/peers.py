@@ -34,22 +34,23 @@ def segment_reduce(num_segments: int, reduce: str) -> Peers:
     return {"torch-scatter": torch_scatter}
 
 
-def composite(alpha: Callable[..., Tensor]) -> Peers:
-    """For inputs ``(sdf, inv_s, t[, values])`` and the results weights, depth, opacity and values.
+def composite(alpha: Callable[[Tensor, Tensor], Tensor] | None = None) -> Peers:
+    """For inputs ``(sdf, inv_s, t[, values])`` or ``(alpha, t[, values])``; results weights, depth, opacity, values.
 
     Args:
-        alpha: opacities ``[R, S]`` from ``sdf`` and ``inv_s``, in plain PyTorch; nerfacc starts from there.
+        alpha: opacities ``[R, S]``, from which nerfacc starts, of ``sdf`` and ``inv_s`` in plain PyTorch; None where
+            the inputs hold them.
     """
 
     def nerfacc() -> Variant:
         from nerfacc import accumulate_along_rays, render_weight_from_alpha
 
-        def render(sdf: Tensor, inv_s: Tensor, t: Tensor, values: Tensor | None = None) -> tuple[Tensor, ...]:
-            weights, _ = render_weight_from_alpha(alpha(sdf, inv_s))
+        def render(*inputs: Tensor) -> tuple[Tensor, ...]:
+            opacities, (t, *values) = (inputs[0], inputs[1:]) if alpha is None else (alpha(*inputs[:2]), inputs[2:])
+            weights, _ = render_weight_from_alpha(opacities)
             depth = accumulate_along_rays(weights, t[..., None])[:, 0]
             opacity = accumulate_along_rays(weights)[:, 0]
-            sums = weights, depth, opacity
-            return sums if values is None else (*sums, accumulate_along_rays(weights, values))
+            return weights, depth, opacity, *(accumulate_along_rays(weights, value) for value in values)
 
         return Variant(render)
 

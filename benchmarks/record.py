@@ -12,8 +12,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks.allocator import current_allocator
 from benchmarks.compare import against_earlier, change_table, earlier_text
-from benchmarks.measure import Ceilings, current_allocator, machine_record
+from benchmarks.measure import Ceilings, machine_record
 from benchmarks.report import SCHEMA, Row, Table, ceiling_table, compare, comparison_table, missing_peers, row_table
 
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import subprocess
@@ -14,10 +15,11 @@ from typing import Any
 
 import pytest
 import torch
+from PIL import Image
 
 from benchmarks import bench_ops, bench_step, cases
 from benchmarks.bench_ops import expected_results, make_cases, run_phase
-from benchmarks.case import BACKWARD, FORWARD, SECOND, Variant
+from benchmarks.case import BACKWARD, BACKWARD_ALONE, FORWARD, SECOND, SECOND_ALONE, Variant
 from benchmarks.cases import REAL, TINY
 from benchmarks.measure import Ceilings, Timing, time_interleaved
 from benchmarks.options import parse
@@ -27,13 +29,19 @@ from pred import _native
 ROOT = Path(__file__).resolve().parent.parent
 PHASES = {
     "sample_bev": {FORWARD, BACKWARD, SECOND},
+    "sample_bev_with_grad": {FORWARD, BACKWARD},
+    "sample_volume": {FORWARD, BACKWARD, SECOND},
+    "sample_volume_with_grad": {FORWARD, BACKWARD},
     "sdf_to_alpha": {FORWARD, BACKWARD},
+    "composite_alpha": {FORWARD, BACKWARD},
     "composite_rays": {FORWARD, BACKWARD},
     "resample_rays": {FORWARD},
+    "sample_pdf": {FORWARD},
     "voxelize": {FORWARD},
     "segment_reduce": {FORWARD, BACKWARD},
     "step": {BACKWARD},
 }
+FOLLOWING = {BACKWARD: BACKWARD_ALONE, SECOND: SECOND_ALONE}
 
 
 def run_cli(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -53,9 +61,12 @@ def check_rows(rows: list[dict[str, Any]]) -> None:
         timing = row["timing"]
         assert 0 < timing["q25_s"] <= timing["median_s"] <= timing["q75_s"], name
         assert timing["samples"] >= len(timing["round_medians_s"]) == 3, name
-        assert row["error"] is not None and row["error"] < 1e-3, name
+        limit = 1e-2 if "bfloat16" in row["case"] else 1e-3  # neighbouring bfloat16 numbers are 4e-3 to 8e-3 apart
+        assert row["error"] is not None and row["error"] < limit, name
         assert row["items"] > 0 and row["rates"]["items_per_s"] == pytest.approx(row["items"] / timing["median_s"])
-        assert (row["traffic_bytes"] > 0 and row["traffic"]) or (row["flop"] > 0 and row["work"]), name
+        assert row["peak_memory_bytes"] is None or row["peak_memory_bytes"] >= 0, name
+        if row["phase"] != SECOND_ALONE:  # its share of the bytes is not declared
+            assert (row["traffic_bytes"] > 0 and row["traffic"]) or (row["flop"] > 0 and row["work"]), name
 
 
 def test_every_case_runs(tmp_path: Path) -> None:
@@ -79,6 +90,8 @@ def test_every_case_runs(tmp_path: Path) -> None:
 
     check_rows(result["rows"])
     for op, phases in PHASES.items():
+        if op != "step":
+            phases = phases | {FOLLOWING[phase] for phase in phases & set(FOLLOWING)}
         assert {row["phase"] for row in result["rows"] if row["op"] == op} == phases
     for row in result["rows"]:
         assert row["case"] in done.stdout and row["contender"] in done.stdout
@@ -86,15 +99,27 @@ def test_every_case_runs(tmp_path: Path) -> None:
         for comparison in result["comparisons"]:
             assert comparison["speedup"]["eager"]["ratio"] > 0, comparison
             assert comparison["targets"] == []  # they belong to the real sizes
+    markdown = out.with_suffix(".md").read_text()
+    assert f"`{result['command']}`" in markdown and "| case | phase | threads | contender | ms |" in markdown
+    if importlib.util.find_spec("matplotlib"):
+        with Image.open(out.with_suffix(".png")) as picture:
+            assert picture.width >= 1000 and picture.height > 500
+    else:
+        assert "pip install 'pred-lidar[bench]'" in done.stdout
     step = {row["contender"]: row for row in result["rows"] if row["op"] == "step"}
     assert step["eager"]["peak_memory_bytes"] > 0 and step["reference"]["peak_memory_bytes"] > 0
 
 
 def test_default_allocator_runs_beside(tmp_path: Path) -> None:
-    out = tmp_path / "result.json"
+    out, old = tmp_path / "result.json", tmp_path / "old.json"
+    nothing = {"schema": 1, "complete": True, "rows": [], "comparisons": [], "machine": {}, "versions": {}}
+    old.write_text(json.dumps(nothing))
     command = ["--ops", "resample_rays", "--sizes", "tiny", "--threads", "1", "--contenders", "ours,eager"]
-    done = run_cli(*command, "--min-time", "0.005", "--out", str(out))
+    done = run_cli(*command, "--min-time", "0.005", "--out", str(out), "--compare", str(old), "--fail-below", "0.9")
     assert done.returncode == 0, done.stderr
+    assert f"against {old}" in done.stdout and "no case, phase and number of threads is in both" in done.stdout
+    assert f"warning: torch differs: {torch.__version__} now, None then" in done.stdout
+    assert json.loads(out.read_text())["earlier"]["changes"] == []
     default = json.loads(out.read_text())["default_allocator"]
     assert default["allocator"] == "default"
     assert not any(name.startswith("MALLOC_") for name in default["environment"])
@@ -103,7 +128,7 @@ def test_default_allocator_runs_beside(tmp_path: Path) -> None:
 
 
 def test_compiled_runs_or_says_why_not() -> None:
-    (case,) = make_cases("sdf_to_alpha", TINY)
+    (case, *_) = make_cases("sdf_to_alpha", TINY)
     phase = case.phases[0]
     (row,) = run_phase(case, phase, expected_results(case, phase), 1, ["compiled"], 0.005, 3, lambda step: None)
     assert row.contender == "compiled closed form"
@@ -118,6 +143,10 @@ def test_compiled_runs_or_says_why_not() -> None:
         (["--threads", "two"], "must be positive numbers"),
         (["--min-time", "0"], "must be above 0, got 0.0"),
         (["--sizes", "huge"], "invalid choice: 'huge'"),
+        (["--fail-below", "0.9"], "--fail-below needs --compare"),
+        (["--compare", "none.json"], "none.json: must be a record of python -m benchmarks, got no such file"),
+        (["--out", "result.png"], "--out must name the JSON record, got result.png"),
+        (["--trace", "a", "--capture", "b"], "not allowed with argument --trace"),
     ],
 )
 def test_wrong_arguments(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -169,14 +198,14 @@ def test_contenders_take_turns() -> None:
 
 
 def test_traffic_formulas() -> None:
-    (bev, _) = make_cases("sample_bev", TINY)
+    bev, *_ = make_cases("sample_bev", TINY)
     height_width_channels, samples, rows = 12 * 12 * 8, 64, 64 * 8
     assert [phase.traffic_bytes for phase in bev.phases] == [
         4 * (height_width_channels + 2 * samples + rows),
         4 * (3 * height_width_channels + 6 * samples + 2 * rows),
         4 * (4 * height_width_channels + 12 * samples + 5 * rows),
     ]
-    depth, classes = make_cases("composite_rays", TINY)
+    depth, classes, *_ = make_cases("composite_rays", TINY)
     assert [phase.traffic_bytes for phase in depth.phases] == [4 * 3 * 5 * 14, 4 * 6 * 5 * 14]
     assert [phase.traffic_bytes for phase in classes.phases] == [4 * (3 + 19) * 5 * 14, 4 * (6 + 3 * 19) * 5 * 14]
     (resample,) = make_cases("resample_rays", TINY)
@@ -223,9 +252,9 @@ def row(contender: str, kind: str, times: Timing | None, memory: int | None = No
 def test_comparison_is_with_the_fastest_eager_and_against_the_targets() -> None:
     ceilings = {2: Ceilings(2, copy_bytes_per_s=1e6, matrix_flop_per_s=1e9)}
     rows = [
-        row("ours", "ours", timing(0.01, 0.02, 0.03), memory=100),
+        row("ours", "ours", timing(0.01, 0.02, 0.03), memory=100_000_000),
         row("eager slow", "eager", timing(0.1, 0.1, 0.1)),
-        row("eager fast", "eager", timing(0.05, 0.06, 0.06), memory=300),
+        row("eager fast", "eager", timing(0.05, 0.06, 0.06), memory=300_000_000),
         row("compiled x", "compiled", None),
     ]
     (comparison,) = compare(rows, ceilings)

@@ -166,9 +166,9 @@ static inline void search(int64_t num_new, const Row<T>& row) {
   }
 }
 
-// Samples in the order of u, whatever that is. The cdf and u must be there.
+// Samples in the order of u, whatever that is. Takes the row by value, and so leaves its caller's in registers.
 template <typename T>
-static inline void exact_samples(bool has_cdf, int64_t num_new, const Row<T>& row, T* __restrict samples) {
+static __attribute__((noinline)) void exact_samples(bool has_cdf, int64_t num_new, Row<T> row, T* __restrict samples) {
   search(num_new, row);
   const T* __restrict t = row.t, * __restrict cdf = row.cdf, * __restrict u = row.u;
   const int32_t* __restrict above = row.low;

@@ -167,10 +167,10 @@ static void sort(T* x, int64_t n) {
   }
 }
 
-// The merged row of t and of the new samples, which stand in row.out behind the place of t.
+// The merged row of t and of the new samples, which stand in `row` behind the place of t.
 template <typename T>
-static void merge_any(const T* t, int64_t num_samples, int64_t num_new, const Row<T>& row, T* merged) {
-  const T* added = row.out + num_samples;
+static __attribute__((noinline)) void merge_any(const T* t, int64_t num_samples, int64_t num_new, T* row, T* merged) {
+  const T* added = row + num_samples;
   if (ascending(t, num_samples) && ascending(added, num_new)) {
     for (int64_t i = 0, k = 0; i + k < num_samples + num_new;) {
       const bool old = k == num_new || (i < num_samples && !(added[k] < t[i]));
@@ -180,9 +180,9 @@ static void merge_any(const T* t, int64_t num_samples, int64_t num_new, const Ro
     }
     return;
   }
-  for (int64_t i = 0; i < num_samples; ++i) row.out[i] = t[i];
-  sort(row.out, num_samples + num_new);
-  for (int64_t i = 0; i < num_samples + num_new; ++i) merged[i] = row.out[i];
+  for (int64_t i = 0; i < num_samples; ++i) row[i] = t[i];
+  sort(row, num_samples + num_new);
+  for (int64_t i = 0; i < num_samples + num_new; ++i) merged[i] = row[i];
 }
 
 template <typename T>
@@ -221,7 +221,7 @@ static void resample_exact(const ResampleRaysArgs<T>& a, T* merged, T* scratch, 
       for (int64_t i = 0; i < out_size; ++i) out[i] = from[i];
     } else {
       exact_samples(has_cdf, a.num_new, row, row.out + a.num_samples);
-      merge_any(row.t, a.num_samples, a.num_new, row, out);
+      merge_any(row.t, a.num_samples, a.num_new, row.out, out);
     }
   }
 }
@@ -236,7 +236,7 @@ static void resample_published(const ResampleRaysArgs<T>& a, T* merged, T* scrat
     read_ranges(a.t + ray * a.num_samples, row);
     published_distribution(a.rule, a.weights + ray * a.weight_stride, row);
     published_samples(a.rule, a.num_new, row, row.out + a.num_samples);
-    merge_any(row.t, a.num_samples, a.num_new, row, merged + ray * (a.num_samples + a.num_new));
+    merge_any(row.t, a.num_samples, a.num_new, row.out, merged + ray * (a.num_samples + a.num_new));
   }
 }
 

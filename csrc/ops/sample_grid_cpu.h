@@ -11,36 +11,13 @@
 
 #include <type_traits>
 
-#include "math/lanes.h"
+#include "math/half_lanes.h"
 #include "ops/sample_grid.h"
 
 namespace pred::PRED_ISA {
 namespace {
 
 #define PRED_INLINE inline __attribute__((always_inline))
-
-// N stored values, widened; and back, rounded.
-template <int N, typename S>
-PRED_INLINE Vec<Compute<S>, N> load_values(const S* from) {
-  if constexpr (std::is_same_v<S, Compute<S>>) {
-    return load<N>(from);
-  } else {
-    Compute<S> wide[N];
-    for (int lane = 0; lane < N; ++lane) wide[lane] = widen(from[lane]);
-    return load<N>(wide);
-  }
-}
-
-template <int N, typename S>
-PRED_INLINE void store_values(S* to, Vec<Compute<S>, N> values) {
-  if constexpr (std::is_same_v<S, Compute<S>>) {
-    store(to, values);
-  } else {
-    Compute<S> wide[N];
-    store(wide, values);
-    for (int lane = 0; lane < N; ++lane) to[lane] = narrow<S>(wide[lane]);
-  }
-}
 
 template <typename T>
 constexpr int kNarrowWidth = kWidth<T> < 4 ? kWidth<T> : 4;

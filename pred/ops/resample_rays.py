@@ -53,10 +53,10 @@ def resample_rays(
     Deterministic for any thread count.
     """
     rule = (mode, histogram_padding, eps, min_width)
-    arguments = pdf_arguments("resample_rays", "t", t, weights, num_samples, u, *rule)
+    t, weights, u = pdf_arguments("resample_rays", "t", t, weights, num_samples, u, *rule)
     if not _native.use_native("resample_rays", t):
-        return _merged(*arguments, *rule)
-    out: Tensor = torch.ops.pred.resample_rays(*arguments, *rule)
+        return _merged(t, weights, u, *rule)
+    out: Tensor = torch.ops.pred.resample_rays(t, weights, u, *rule)
     return out
 
 
@@ -73,7 +73,8 @@ def resample_rays_reference(
 ) -> Tensor:  # [R, S + num_samples]
     """Plain PyTorch form of :func:`resample_rays`: search, interpolate, sort."""
     rule = (mode, histogram_padding, eps, min_width)
-    return _merged(*pdf_arguments("resample_rays", "t", t, weights, num_samples, u, *rule), *rule)
+    t, weights, u = pdf_arguments("resample_rays", "t", t, weights, num_samples, u, *rule)
+    return _merged(t, weights, u, *rule)
 
 
 def _merged(

@@ -66,10 +66,10 @@ def sample_pdf(
     Deterministic for any thread count.
     """
     rule = (mode, histogram_padding, eps, min_width)
-    arguments = pdf_arguments("sample_pdf", "edges", edges, weights, num_samples, u, *rule)
+    edges, weights, u = pdf_arguments("sample_pdf", "edges", edges, weights, num_samples, u, *rule)
     if not _native.use_native("sample_pdf", edges):
-        return samples_reference(*arguments, *rule)
-    out: Tensor = torch.ops.pred.sample_pdf(*arguments, *rule)
+        return samples_reference(edges, weights, u, *rule)
+    out: Tensor = torch.ops.pred.sample_pdf(edges, weights, u, *rule)
     return out
 
 
@@ -86,7 +86,8 @@ def sample_pdf_reference(
 ) -> Tensor:  # [R, n]
     """Plain PyTorch form of :func:`sample_pdf`: cumulative sum, search, interpolation."""
     rule = (mode, histogram_padding, eps, min_width)
-    return samples_reference(*pdf_arguments("sample_pdf", "edges", edges, weights, num_samples, u, *rule), *rule)
+    edges, weights, u = pdf_arguments("sample_pdf", "edges", edges, weights, num_samples, u, *rule)
+    return samples_reference(edges, weights, u, *rule)
 
 
 @torch.no_grad()

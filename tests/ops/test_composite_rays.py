@@ -115,6 +115,85 @@ def test_sharp_surfaces_stay_finite(backend: str, sharp: float, dtype: torch.dty
         assert (weights - expected).abs().max() <= 1e-6
 
 
+# (d_0, d_1, s, opacity, d opacity / d d_0, d opacity / d d_1) of a ray of two samples.
+TWO_SAMPLES = {
+    "falling, inside": (-2.0, -2.1, 64.0, 0.998338, 0.106339, -0.106339),
+    "rising, inside": (-3.0, -2.9, 64.0, 0.0, 0.0, 0.0),
+    "nearly flat, inside": (-1.0, -1.0001, 64.0, 0.00638, 63.59, -63.59),
+    # Phi(5.8) = 0.9969816, Phi(6) = 0.9975274: 1 - ratio; s ratio (1 - Phi) of either end
+    "small crossing": (0.3, 0.29, 20.0, 5.4715e-4, 20 * 0.9994528 * 0.0024726, -20 * 0.9994528 * 0.0030184),
+    "tie": (0.5, 0.5, 64.0, 0.0, 0.0, 0.0),
+    "free space": (10.0, 9.0, 64.0, 0.0, 0.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", TWO_SAMPLES)
+def test_two_samples(backend: str, name: str, dtype: torch.dtype) -> None:
+    """Where the quotient of sigmoids is 0 / 0 or cancels, and where NeuS's epsilons make alpha 1 or 1e-5."""
+    before, after, inv_s, opacity, grad_before, grad_after = TWO_SAMPLES[name]
+    sdf = torch.tensor([[before, after]], dtype=dtype, requires_grad=True)
+    out = composite_rays(sdf, inv_s, torch.tensor([[3.0, 5.0]], dtype=dtype))
+    # A difference of 1e-4 between float32 numbers near 1 is exact to 6e-4 only.
+    rel = 1e-3 if name == "nearly flat, inside" else 2e-5
+    assert out.opacity.item() == pytest.approx(opacity, rel=rel, abs=1e-12)
+    assert depth(out).item() == pytest.approx(3 * opacity, rel=rel, abs=1e-12)
+    (grad,) = torch.autograd.grad(out.opacity.sum(), sdf)
+    assert grad[0].tolist() == pytest.approx([grad_before, grad_after], rel=1e-4, abs=1e-12)
+
+
+def test_last_sample(backend: str) -> None:
+    """It has no successor: weight 0, and what is left stays left; or opaque, and takes it all."""
+    sdf, t = torch.logit(torch.tensor([[0.8, 0.4]])), torch.tensor([[10.0, 20.0]])  # alpha_0 = 1 - 0.4 / 0.8
+    out, opaque = composite_rays(sdf, 1.0, t), composite_rays(sdf, 1.0, t, last="opaque")
+    assert out.weights[0].tolist() == pytest.approx([0.5, 0.0])
+    assert opaque.weights[0].tolist() == pytest.approx([0.5, 0.5])
+    assert depth(opaque).item() == pytest.approx(15.0) and opaque.opacity.item() == pytest.approx(1.0)
+    one = composite_rays(sdf[:, :1], 1.0, t[:, :1])
+    assert one.weights.tolist() == [[0.0]] and depth(one).item() == 0
+    assert depth(composite_rays(sdf[:, :1], 1.0, t[:, :1], last="opaque")).item() == 10
+
+
+def test_partly_transparent_ray(backend: str) -> None:
+    """Half of the light is left: the depth is half way to 0, or divided by the opacity; other rays play no part."""
+    sdf = torch.logit(torch.tensor([[0.8, 0.4], [0.4, 0.8]]))
+    t = torch.tensor([[10.0, 20.0], [1.0, 90.0]])
+    assert depth(composite_rays(sdf, 1.0, t)).tolist() == pytest.approx([5.0, 0.0])
+    assert depth(composite_rays(sdf, 1.0, t, normalize_depth=True)).tolist() == pytest.approx([10.0, 0.0])
+
+
+def test_duplicate_ranges(backend: str) -> None:
+    """Samples in one place have one distance: the section between them is empty, the others are as without it."""
+    sdf = torch.tensor([[1.0, 0.0, 0.0, -1.0]], requires_grad=True)
+    out = composite_rays(sdf, 1.0, torch.tensor([[2.0, 4.0, 4.0, 8.0]]))
+    w = 0.23105857863 / 0.73105857863
+    assert out.weights[0].tolist() == pytest.approx([w, 0.0, w, 0.0])
+    assert depth(out).item() == pytest.approx(6 * w)
+    (grad,) = torch.autograd.grad(depth(out).sum(), sdf)
+    assert grad.isfinite().all()
+
+
+def test_infinite_distances(backend: str) -> None:
+    """inf in front and -inf behind are no surface and a certain one; two of a kind are NaN, in their ray alone."""
+    inf = torch.inf
+    sdf = torch.tensor([[inf, 0.0, -inf, -inf], [inf, inf, 0.0, -1.0], [1.0, 0.0, -1.0, -1.0]])
+    out = composite_rays(sdf, 1.0, torch.tensor([[1.0, 2.0, 4.0, 8.0]]).expand(3, -1))
+    assert out.weights[0, :2].tolist() == pytest.approx([0.5, 0.5])
+    assert out.opacity[1].isnan()
+    w = 0.23105857863 / 0.73105857863
+    assert depth(out)[2].item() == pytest.approx(3 * w)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_huge_sharpness(backend: str, dtype: torch.dtype) -> None:
+    """s = 1e6: a step at the crossing, whose derivative is 0 in floating point."""
+    sdf = torch.tensor([[2.0, 1.0, -1.0, -2.0]], dtype=dtype, requires_grad=True)
+    out = composite_rays(sdf, 1e6, torch.tensor([[1.0, 2.0, 4.0, 8.0]], dtype=dtype))
+    assert out.weights.tolist() == [[0.0, 1.0, 0.0, 0.0]] and depth(out).item() == 2.0
+    (grad,) = torch.autograd.grad(depth(out).sum(), sdf)
+    assert not grad.any()
+
+
 def test_free_space_is_empty(backend: str) -> None:
     """223 samples of s d >> 1 add up to nothing: no phantom opacity that fogs the depth behind it."""
     sdf = torch.linspace(30, 2, 224)[None]
