@@ -37,6 +37,14 @@ class Sizes:
     points: int
     voxel_m: float
     """Edge of the cubic voxels of `voxelize`."""
+    voxel_points: int
+    """Points per voxel of `voxelize_hard`."""
+    max_voxels: int
+    search_points: int
+    """Points of `farthest_point_sample`, `knn` and `ball_query`."""
+    samples: int
+    """Samples of the first; the queries of the others."""
+    neighbors: int
     pillar_m: float
     """Edge of the pillars whose points `segment_reduce` joins."""
     features: int
@@ -56,6 +64,11 @@ REAL = Sizes(
     classes=19,
     points=250_000,
     voxel_m=0.1,
+    voxel_points=10,
+    max_voxels=160_000,
+    search_points=32_768,
+    samples=2048,
+    neighbors=16,
     pillar_m=0.2,
     features=64,
     step_rays=512,
@@ -72,6 +85,11 @@ TINY = Sizes(
     classes=19,
     points=500,
     voxel_m=0.4,
+    voxel_points=3,
+    max_voxels=100,
+    search_points=300,
+    samples=12,
+    neighbors=4,
     pillar_m=3.2,
     features=4,
     step_rays=3,

@@ -1,6 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of the ops on points: voxels, segments."""
+"""Cases of the ops on points: voxels, segments, samples, neighbours."""
 
 from __future__ import annotations
 
@@ -80,6 +80,176 @@ def _sorted_unique(key: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return keys, torch.empty_like(inverse).scatter_(0, order, inverse), counts
 
 
+def _voxelize_hard_cases(sizes: Sizes) -> list[Case]:
+    points = cases.lidar_points(sizes.points)
+    columns, size = points.shape[1], (sizes.voxel_m,) * 3
+    limits = (sizes.voxel_points, sizes.max_voxels)
+    arguments = (size, cases.POINT_RANGE_M, *limits)
+    inputs = (points, torch.tensor([0, sizes.points]))
+    voxels = reference.voxelize_hard(*inputs, *arguments).voxels
+    forward = points.nbytes + voxels.nbytes + 40 * len(voxels)
+    return [
+        Case(
+            op="voxelize_hard",
+            name=f"voxelize_hard {sizes.points} points, {sizes.voxel_m} m, {sizes.voxel_points} per voxel",
+            unit="points",
+            items=sizes.points,
+            inputs=inputs,
+            ours=lambda points, offsets: ops.voxelize_hard(points, offsets, *arguments),
+            reference=lambda points, offsets: reference.voxelize_hard(points, offsets, *arguments),
+            eager={"sort": Variant(lambda points, offsets: _eager_voxelize_hard(points, offsets, size, *limits))},
+            compiled=("sort",),
+            derivative_in=(0,),
+            tolerance=0.0,
+            phases=(
+                Phase(FORWARD, "4 N D + 4 M P D + 40 M", forward, (Target("peer", 2),)),
+                Phase(BACKWARD, "8 N D + 8 M P D + 40 M", forward + points.nbytes + voxels.nbytes),
+            ),
+            peers=peers.voxelize_hard(columns, *arguments),
+        )
+    ]
+
+
+def _eager_voxelize_hard(
+    points: Tensor, offsets: Tensor, size: tuple[float, ...], max_points: int, max_voxels: int
+) -> tuple[Tensor, ...]:
+    coords, point_to_voxel, counts = _eager_voxelize(points.detach(), offsets, size, _sorted_unique)
+    rows = (point_to_voxel >= 0).nonzero()[:, 0]
+    voxel, order = point_to_voxel[rows].sort(stable=True)
+    rows = rows[order]
+    starts = counts.cumsum(0) - counts
+    place = torch.arange(len(rows)) - starts[voxel]
+    kept = rows[starts].argsort()[:max_voxels]  # the inputs are one frame
+    number = torch.full_like(counts, -1)
+    number[kept] = torch.arange(len(kept))
+    fits = (number[voxel] >= 0) & (place < max_points)
+    slot = number[voxel[fits]] * max_points + place[fits]
+    flat = points.new_zeros(len(kept) * max_points, points.shape[1]).index_copy(0, slot, points[rows[fits]])
+    return flat.view(-1, max_points, points.shape[1]), coords[kept], counts[kept].clamp_max(max_points)
+
+
+def _farthest_point_sample_cases(sizes: Sizes) -> list[Case]:
+    points = cases.lidar_points(sizes.search_points)[:, :3].contiguous()
+    count = sizes.samples
+    return [
+        Case(
+            op="farthest_point_sample",
+            name=f"farthest_point_sample {count} of {sizes.search_points}",
+            unit="points",
+            items=sizes.search_points,
+            inputs=(points, torch.tensor([0, sizes.search_points])),
+            ours=lambda points, offsets: (ops.farthest_point_sample(points, offsets, count),),
+            reference=lambda points, offsets: (reference.farthest_point_sample(points, offsets, count),),
+            eager={"loop": Variant(lambda points, offsets: (_eager_farthest(points, count),))},
+            compiled=(),
+            tolerance=0.0,
+            phases=(Phase(FORWARD, "12 N + 8 S", points.nbytes + 8 * count),),
+        )
+    ]
+
+
+def _eager_farthest(points: Tensor, count: int) -> Tensor:  # [1, count]
+    x, y, z = points.t().contiguous()
+    distance = torch.full_like(x, torch.inf)
+    chosen = torch.zeros(count, dtype=torch.int64)
+    for i in range(1, count):
+        last = chosen[i - 1]
+        dx, dy, dz = x - x[last], y - y[last], z - z[last]
+        torch.minimum(distance, dx.mul_(dx).add_(dy.mul_(dy)).add_(dz.mul_(dz)), out=distance)
+        chosen[i] = distance.argmax()
+    return chosen[None]
+
+
+_CHUNK = 256  # queries whose distances to all points are held at once
+
+
+def _search_inputs(sizes: Sizes) -> tuple[Tensor, ...]:
+    """One frame, and queries as a set-abstraction layer has them: some of the points."""
+    points = cases.lidar_points(sizes.search_points)[:, :3].contiguous()
+    frame = torch.tensor([0, len(points)])
+    queries = points[ops.farthest_point_sample(points, frame, sizes.samples)[0]]
+    return points, frame, queries, torch.tensor([0, len(queries)])
+
+
+def _knn_cases(sizes: Sizes) -> list[Case]:
+    inputs, k = _search_inputs(sizes), sizes.neighbors
+    return [
+        Case(
+            op="knn",
+            name=f"knn {k} of {sizes.search_points} points, {sizes.samples} queries",
+            unit="queries",
+            items=sizes.samples,
+            inputs=inputs,
+            # Only distances are compared: of points equally far others may be chosen.
+            ours=lambda *inputs: (ops.knn(*inputs, k).squared_distance,),
+            reference=lambda *inputs: (reference.knn(*inputs, k).squared_distance,),
+            eager={
+                name: Variant(lambda points, _, queries, __, mode=mode: (_eager_knn(points, queries, k, mode),))
+                for name, mode in _CDIST.items()
+            },
+            compiled=(),
+            phases=(
+                Phase(FORWARD, "12 N + 12 M + 12 M k", inputs[0].nbytes + inputs[2].nbytes + 12 * sizes.samples * k),
+            ),
+        )
+    ]
+
+
+_CDIST = {
+    "cdist, topk": "donot_use_mm_for_euclid_dist",
+    "cdist by products, topk": "use_mm_for_euclid_dist",
+}
+
+
+def _eager_knn(points: Tensor, queries: Tensor, k: int, mode: str) -> Tensor:  # [M, k]
+    index = torch.cat(
+        [
+            torch.cdist(chunk, points, compute_mode=mode).topk(k, largest=False).indices
+            for chunk in queries.split(_CHUNK)
+        ]
+    )
+    return (points[index] - queries[:, None]).square().sum(dim=-1)
+
+
+def _ball_query_cases(sizes: Sizes) -> list[Case]:
+    inputs, count, radius_m = _search_inputs(sizes), sizes.neighbors, 0.8
+    return [
+        Case(
+            op="ball_query",
+            name=f"ball_query {count} in {radius_m} m of {sizes.search_points} points, {sizes.samples} queries",
+            unit="queries",
+            items=sizes.samples,
+            inputs=inputs,
+            ours=lambda *inputs: ops.ball_query(*inputs, radius_m, count),
+            reference=lambda *inputs: reference.ball_query(*inputs, radius_m, count),
+            eager={
+                "cdist, topk": Variant(lambda points, _, queries, __: _eager_ball(points, queries, radius_m, count))
+            },
+            compiled=(),
+            tolerance=0.0,
+            outliers=2e-3,  # roots are rounded: a point on the sphere may change sides and move its list
+            phases=(
+                Phase(
+                    FORWARD,
+                    "12 N + 20 M + 8 M k",
+                    inputs[0].nbytes + inputs[2].nbytes + 8 * sizes.samples * (1 + count),
+                ),
+            ),
+        )
+    ]
+
+
+def _eager_ball(points: Tensor, queries: Tensor, radius_m: float, count: int) -> tuple[Tensor, Tensor]:
+    none = len(points)
+    row = torch.arange(none)
+    lists = []
+    for chunk in queries.split(_CHUNK):
+        inside = torch.cdist(chunk, points, compute_mode="donot_use_mm_for_euclid_dist") < radius_m
+        lists.append(torch.where(inside, row, none).topk(count, largest=False).values)
+    index = torch.cat(lists)
+    return index.masked_fill(index == none, -1), (index < none).sum(dim=1)
+
+
 def _segment_reduce_cases(sizes: Sizes) -> list[Case]:
     points = cases.lidar_points(sizes.points)
     height_m = cases.POINT_RANGE_M[5] - cases.POINT_RANGE_M[2]
@@ -133,5 +303,9 @@ _EAGER_SEGMENTS = {"scatter_reduce": _eager_scatter_reduce, "index_add": _eager_
 
 CASES: dict[str, Callable[[Sizes], list[Case]]] = {
     "voxelize": _voxelize_cases,
+    "voxelize_hard": _voxelize_hard_cases,
     "segment_reduce": _segment_reduce_cases,
+    "farthest_point_sample": _farthest_point_sample_cases,
+    "knn": _knn_cases,
+    "ball_query": _ball_query_cases,
 }

@@ -51,6 +51,18 @@ STABLE_TORCH_LIBRARY(pred, m) {
   m.def(
       "voxelize(Tensor points, Tensor batch_offsets, float[] voxel_size, float[] point_range, int[] grid_size) -> "
       "(Tensor, Tensor, Tensor)");
+  m.def(
+      "voxelize_hard(Tensor points, Tensor batch_offsets, float[] voxel_size, float[] point_range, int[] grid_size, "
+      "SymInt max_points, SymInt max_voxels) -> (Tensor voxels, Tensor coords, Tensor counts, Tensor point_to_slot)");
+  m.def("voxelize_hard_backward(Tensor grad, Tensor point_to_slot) -> Tensor");
+
+  m.def("farthest_point_sample(Tensor points, Tensor batch_offsets, SymInt num_samples, SymInt start) -> Tensor");
+  m.def(
+      "knn(Tensor points, Tensor batch_offsets, Tensor queries, Tensor query_offsets, SymInt k) -> "
+      "(Tensor indices, Tensor squared_distance)");
+  m.def(
+      "ball_query(Tensor points, Tensor batch_offsets, Tensor queries, Tensor query_offsets, float radius, "
+      "SymInt max_points) -> (Tensor indices, Tensor counts)");
 
   m.def("sdf_to_alpha(Tensor sdf, Tensor inv_s, bool last_opaque, Tensor? ray_offsets=None) -> Tensor");
   m.def(

@@ -38,7 +38,11 @@ PHASES = {
     "resample_rays": {FORWARD},
     "sample_pdf": {FORWARD},
     "voxelize": {FORWARD},
+    "voxelize_hard": {FORWARD, BACKWARD},
     "segment_reduce": {FORWARD, BACKWARD},
+    "farthest_point_sample": {FORWARD},
+    "knn": {FORWARD},
+    "ball_query": {FORWARD},
     "step": {BACKWARD},
 }
 FOLLOWING = {BACKWARD: BACKWARD_ALONE, SECOND: SECOND_ALONE}

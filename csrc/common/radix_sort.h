@@ -41,7 +41,7 @@ inline int bits_for(int64_t count) {
 template <typename Item, class Pack>
 SortedItems<Item> sort_rows(int64_t num_rows, int row_bits, int key_bits, const Pack& pack) {
   constexpr int64_t kBlock = 32768, kMaxBlocks = 64;
-  constexpr int kMaxDigitBits = 13;  // 26 key bits, 0.1 m voxels in the nuScenes range, take two passes
+  constexpr int kMaxDigitBits = 14;  // 27 key bits, 0.1 m voxels in the nuScenes range, take two passes
   PRED_CHECK(num_rows < (int64_t(1) << 31), "sort_rows: there must be fewer than 2^31 rows, got ", num_rows);
   int64_t num_blocks = (num_rows + kBlock - 1) / kBlock;
   num_blocks = num_blocks < 1 ? 1 : num_blocks > kMaxBlocks ? kMaxBlocks : num_blocks;

@@ -6,6 +6,7 @@
 #include <torch/csrc/stable/ops.h>
 
 #include <atomic>
+#include <memory>
 #include <string>
 #include <tuple>
 
@@ -15,7 +16,7 @@
 namespace pred {
 namespace {
 
-PRED_KERNELS_BY_TYPE(SegmentReduceKernels, segment_reduce)
+PRED_KERNELS_BY_STORAGE(SegmentReduceKernels, segment_reduce)
 
 SegmentReduction reduction(const char* op, const std::string& name) {
   if (name == "sum") return SegmentReduction::kSum;
@@ -28,10 +29,10 @@ SegmentReduction reduction(const char* op, const std::string& name) {
 int64_t row_grain(int64_t channels) { return 1 + 16384 / (channels + 4); }
 
 // `index` lies in [-1, num_segments); the message names the first row for which it does not.
-template <typename T>
+template <typename S>
 void check_index(const Tensor& index, int64_t num_segments) {
   const int64_t* data = index.const_data_ptr<int64_t>();
-  const auto& k = kernels<T>();
+  const auto& k = kernels<S>();
   std::atomic<bool> valid{true};
   parallel(index.size(0), 32768, [&](int64_t begin, int64_t end) {
     if (!k.is_valid(data, num_segments, begin, end)) valid = false;
@@ -43,26 +44,33 @@ void check_index(const Tensor& index, int64_t num_segments) {
   }
 }
 
-template <typename T>
+template <typename S>
 std::tuple<Tensor, Tensor> forward(const Tensor& features_in, const Tensor& index_in, int64_t num_segments,
                                    SegmentReduction how) {
-  const SegmentReduceKernels<T>& k = kernels<T>();
+  using T = Compute<S>;
+  const SegmentReduceKernels<S>& k = kernels<S>();
   const Tensor features = torch::stable::contiguous(features_in), index = torch::stable::contiguous(index_in);
   const int64_t num_rows = features.size(0), channels = features.size(1);
-  check_index<T>(index, num_segments);
+  check_index<S>(index, num_segments);
 
   Tensor out = torch::stable::new_empty(features, {num_segments, channels});
   Tensor saved = how == SegmentReduction::kSum ? torch::stable::new_empty(index, {0}, ScalarType::Int)
                  : how == SegmentReduction::kMean
                      ? torch::stable::new_empty(index, {num_segments}, ScalarType::Int)
                      : torch::stable::new_empty(index, {num_segments, channels}, ScalarType::Int);
-  const SegmentReduceArgs<T> a{features.const_data_ptr<T>(), index.const_data_ptr<int64_t>(), num_rows, channels};
-  T* out_data = out.mutable_data_ptr<T>();
+  const SegmentReduceArgs<S> a{storage<S>(features), index.const_data_ptr<int64_t>(), num_rows, channels};
+  const std::unique_ptr<T[]> wide(std::is_same_v<S, T> ? nullptr : new T[num_segments * channels]);
+  T* results = wide ? wide.get() : static_cast<T*>(out.mutable_data_ptr());
   int32_t* saved_data = saved.mutable_data_ptr<int32_t>();
   // Each task reads the whole index: no more tasks than there is work for.
   const int64_t num_tasks = 1 + num_rows * (channels + 4) / 32768;
   parallel(num_segments, num_segments / num_tasks,
-           [&](int64_t begin, int64_t end) { k.forward[int(how)](a, out_data, saved_data, begin, end); });
+           [&](int64_t begin, int64_t end) { k.forward[int(how)](a, results, saved_data, begin, end); });
+  if (wide) {
+    S* rounded = mutable_storage<S>(out);
+    parallel(num_segments * channels, 32768,
+             [&](int64_t begin, int64_t end) { k.round(results, rounded, begin, end); });
+  }
   return {out, saved};
 }
 
@@ -77,8 +85,8 @@ std::tuple<Tensor, Tensor> segment_reduce(const Tensor& features, const Tensor& 
   PRED_CHECK(features.size(0) < int64_t(1) << 31, op, ": features must have fewer than 2^31 rows, got ",
              features.size(0));
   const SegmentReduction how = reduction(op, reduce);
-  return PRED_DISPATCH_FLOAT(op, features.scalar_type(),
-                             [&] { return forward<T>(features, index, num_segments, how); });
+  return PRED_DISPATCH_STORAGE(op, features.scalar_type(),
+                               [&] { return forward<S>(features, index, num_segments, how); });
 }
 
 Tensor segment_reduce_backward(const Tensor& grad_in, const Tensor& index_in, const Tensor& saved_in,
@@ -94,14 +102,14 @@ Tensor segment_reduce_backward(const Tensor& grad_in, const Tensor& index_in, co
   PRED_CHECK(fits, op, ": saved must belong to grad of shape ", shape_text(grad_in), ", got ", shape_text(saved_in));
   const Tensor grad = torch::stable::contiguous(grad_in), index = torch::stable::contiguous(index_in);
   const Tensor saved = torch::stable::contiguous(saved_in);
-  return PRED_DISPATCH_FLOAT(op, grad.scalar_type(), [&] {
-    check_index<T>(index, num_segments);
+  return PRED_DISPATCH_STORAGE(op, grad.scalar_type(), [&] {
+    check_index<S>(index, num_segments);
     Tensor out = torch::stable::new_empty(grad, {num_rows, channels});
-    const T* grad_data = grad.const_data_ptr<T>();
+    const S* grad_data = storage<S>(grad);
     const int64_t* index_data = index.const_data_ptr<int64_t>();
     const int32_t* saved_data = saved.const_data_ptr<int32_t>();
-    T* out_data = out.mutable_data_ptr<T>();
-    const auto& k = kernels<T>();
+    S* out_data = mutable_storage<S>(out);
+    const auto& k = kernels<S>();
     parallel(num_rows, row_grain(channels), [&](int64_t begin, int64_t end) {
       k.backward[int(how)](grad_data, channels, index_data, saved_data, out_data, begin, end);
     });

@@ -7,10 +7,13 @@
 //   backward   out[i, c]  = grad[s, c]             (sum)          with s = index[i]; 0 if s is -1
 //                         = grad[s, c] / count[s]  (mean)
 //                         = grad[s, c]             (max) if winner[s, c] = i, else 0
+//
+// S is the type in which features and gradients are stored. Sums are made in Compute<S> and rounded once.
 #pragma once
 
 #include "common/host_device.h"
 #include "common/isa.h"
+#include "math/half.h"
 
 namespace pred {
 
@@ -22,21 +25,24 @@ PRED_HOST_DEVICE bool replaces_maximum(T value, T best) {
   return (value > best) | ((value != value) & (best == best));
 }
 
-template <typename T>
+template <typename S>
 struct SegmentReduceArgs {
-  const T* features;     // [N, C]
+  const S* features;     // [N, C]
   const int64_t* index;  // [N] in [-1, S)
   int64_t num_rows, channels;
 };
 
-template <typename T>
+template <typename S>
 struct SegmentReduceKernels {
+  using T = Compute<S>;
   // Whether index[begin .. end) lies in [-1, num_segments).
   bool (*is_valid)(const int64_t* index, int64_t num_segments, int64_t begin, int64_t end);
   // Segments [begin, end). saved: row counts [S] (mean), winning rows [S, C] or -1 (max), unused (sum).
-  void (*forward[3])(const SegmentReduceArgs<T>&, T* out, int32_t* saved, int64_t begin, int64_t end);
+  void (*forward[3])(const SegmentReduceArgs<S>&, T* out, int32_t* saved, int64_t begin, int64_t end);
+  // Elements [begin, end).
+  void (*round)(const T* values, S* out, int64_t begin, int64_t end);
   // Rows [begin, end).
-  void (*backward[3])(const T* grad, int64_t channels, const int64_t* index, const int32_t* saved, T* out,
+  void (*backward[3])(const S* grad, int64_t channels, const int64_t* index, const int32_t* saved, S* out,
                       int64_t begin, int64_t end);
 };
 
@@ -44,3 +50,5 @@ struct SegmentReduceKernels {
 
 PRED_DECLARE_KERNELS(SegmentReduceKernels<float>, segment_reduce_f32)
 PRED_DECLARE_KERNELS(SegmentReduceKernels<double>, segment_reduce_f64)
+PRED_DECLARE_KERNELS(SegmentReduceKernels<BFloat16>, segment_reduce_bf16)
+PRED_DECLARE_KERNELS(SegmentReduceKernels<Float16>, segment_reduce_f16)

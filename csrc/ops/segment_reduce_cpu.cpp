@@ -25,8 +25,9 @@ static inline void prefetch(const T* row, int64_t channels) {
   for (int64_t c = 0; c < channels; c += kCacheLine / int64_t(sizeof(T))) __builtin_prefetch(row + c);
 }
 
-template <typename T, SegmentReduction kReduction>
-static void forward(const SegmentReduceArgs<T>& a, T* out, int32_t* saved, int64_t begin, int64_t end) {
+template <typename S, SegmentReduction kReduction>
+static void forward(const SegmentReduceArgs<S>& a, Compute<S>* out, int32_t* saved, int64_t begin, int64_t end) {
+  using T = Compute<S>;
   constexpr bool kMean = kReduction == SegmentReduction::kMean, kMax = kReduction == SegmentReduction::kMax;
   const int64_t channels = a.channels;
   for (int64_t i = begin * channels; i < end * channels; ++i) out[i] = T(0);
@@ -44,17 +45,18 @@ static void forward(const SegmentReduceArgs<T>& a, T* out, int32_t* saved, int64
       prefetch(out + next * channels, channels);
       if (kMax) prefetch(saved + next * channels, channels);
     }
-    const T* __restrict value = a.features + row * channels;
+    const S* __restrict feature = a.features + row * channels;
     T* __restrict result = out + segment * channels;
     if (kMax) {
       int32_t* __restrict winner = saved + segment * channels;
       for (int64_t c = 0; c < channels; ++c) {
-        const bool replace = (winner[c] < 0) | replaces_maximum(value[c], result[c]);
-        result[c] = replace ? value[c] : result[c];
+        const T value = widen(feature[c]);
+        const bool replace = (winner[c] < 0) | replaces_maximum(value, result[c]);
+        result[c] = replace ? value : result[c];
         winner[c] = replace ? int32_t(row) : winner[c];
       }
     } else {
-      for (int64_t c = 0; c < channels; ++c) result[c] += value[c];
+      for (int64_t c = 0; c < channels; ++c) result[c] += widen(feature[c]);
     }
     if (kMean) ++saved[segment];
   }
@@ -66,45 +68,54 @@ static void forward(const SegmentReduceArgs<T>& a, T* out, int32_t* saved, int64
   }
 }
 
-template <typename T, SegmentReduction kReduction>
-static void backward(const T* grad, int64_t channels, const int64_t* index, const int32_t* saved, T* out, int64_t begin,
+template <typename S>
+static void round(const Compute<S>* values, S* out, int64_t begin, int64_t end) {
+  for (int64_t i = begin; i < end; ++i) out[i] = narrow<S>(values[i]);
+}
+
+template <typename S, SegmentReduction kReduction>
+static void backward(const S* grad, int64_t channels, const int64_t* index, const int32_t* saved, S* out, int64_t begin,
                      int64_t end) {
+  using T = Compute<S>;
   for (int64_t row = begin; row < end; ++row) {
     const int64_t next = index[row + kAhead < end ? row + kAhead : row];
     if (next >= 0) {
       prefetch(grad + next * channels, channels);
       if (kReduction == SegmentReduction::kMax) prefetch(saved + next * channels, channels);
     }
-    T* __restrict result = out + row * channels;
+    S* __restrict result = out + row * channels;
     const int64_t segment = index[row];
     if (segment < 0) {
-      for (int64_t c = 0; c < channels; ++c) result[c] = T(0);
+      for (int64_t c = 0; c < channels; ++c) result[c] = S{};
       continue;
     }
-    const T* __restrict value = grad + segment * channels;
+    const S* __restrict value = grad + segment * channels;
     if (kReduction == SegmentReduction::kSum) {
       for (int64_t c = 0; c < channels; ++c) result[c] = value[c];
     } else if (kReduction == SegmentReduction::kMean) {
       const T count = T(saved[segment]);
-      for (int64_t c = 0; c < channels; ++c) result[c] = value[c] / count;
+      for (int64_t c = 0; c < channels; ++c) result[c] = narrow<S>(widen(value[c]) / count);
     } else {
       const int32_t* __restrict winner = saved + segment * channels;
-      for (int64_t c = 0; c < channels; ++c) result[c] = winner[c] == int32_t(row) ? value[c] : T(0);
+      for (int64_t c = 0; c < channels; ++c) result[c] = winner[c] == int32_t(row) ? value[c] : S{};
     }
   }
 }
 
-template <typename T>
-constexpr SegmentReduceKernels<T> table() {
+template <typename S>
+constexpr SegmentReduceKernels<S> table() {
   using R = SegmentReduction;
   return {is_valid,
-          {forward<T, R::kSum>, forward<T, R::kMean>, forward<T, R::kMax>},
-          {backward<T, R::kSum>, backward<T, R::kMean>, backward<T, R::kMax>}};
+          {forward<S, R::kSum>, forward<S, R::kMean>, forward<S, R::kMax>},
+          round<S>,
+          {backward<S, R::kSum>, backward<S, R::kMean>, backward<S, R::kMax>}};
 }
 
 }  // namespace
 
 const SegmentReduceKernels<float> segment_reduce_f32 = table<float>();
 const SegmentReduceKernels<double> segment_reduce_f64 = table<double>();
+const SegmentReduceKernels<BFloat16> segment_reduce_bf16 = table<BFloat16>();
+const SegmentReduceKernels<Float16> segment_reduce_f16 = table<Float16>();
 
 }  // namespace pred::PRED_ISA

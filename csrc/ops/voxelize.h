@@ -10,6 +10,7 @@
 
 #include "common/host_device.h"
 #include "common/isa.h"
+#include "math/half.h"
 
 namespace pred {
 
@@ -33,19 +34,43 @@ struct VoxelKeyBits {
   int x, y, z, row;  // an item is (b, z, y, x, row), from the highest bits to the lowest
 };
 
-template <typename T>
+// Whether item i of the sorted list is the first of its voxel.
+template <typename Item>
+PRED_HOST_DEVICE bool starts_voxel(const Item* items, int row_bits, int64_t i) {
+  return i == 0 || (items[i] ^ items[i - 1]) >> row_bits != 0;
+}
+
+PRED_HOST_DEVICE int64_t low_bits(uint64_t value, int width) { return int64_t(value & ((uint64_t(1) << width) - 1)); }
+
+template <typename Item>
+PRED_HOST_DEVICE int64_t item_row(Item item, const VoxelKeyBits& bits) {
+  return low_bits(uint64_t(item), bits.row);
+}
+
+// (b, z, y, x)
+template <typename Item>
+PRED_HOST_DEVICE void write_coords(Item item, const VoxelKeyBits& bits, int64_t* coords) {
+  const uint64_t key = uint64_t(item >> bits.row);
+  coords[0] = int64_t(key >> (bits.x + bits.y + bits.z));
+  coords[1] = low_bits(key >> (bits.x + bits.y), bits.z);
+  coords[2] = low_bits(key >> bits.x, bits.y);
+  coords[3] = low_bits(key, bits.x);
+}
+
+// S: the type in which points are stored.
+template <typename S>
 struct VoxelizePoints {
-  const T* points;  // [N, D], element strides below
+  const S* points;  // [N, D], element strides below
   int64_t point_stride, axis_stride;
-  VoxelGrid<T> grid;
+  VoxelGrid<Compute<S>> grid;
   VoxelKeyBits bits;
 };
 
-template <typename T, typename Item>
+template <typename S, typename Item>
 struct VoxelizeKernels {
   // Packs the points [begin, end) of one frame that lie inside, from `items` on; returns how many. The others
   // get voxel -1.
-  int64_t (*pack)(const VoxelizePoints<T>&, int64_t frame, int64_t begin, int64_t end, Item* items,
+  int64_t (*pack)(const VoxelizePoints<S>&, int64_t frame, int64_t begin, int64_t end, Item* items,
                   int64_t* point_to_voxel);
   // How many voxels have their first item in [begin, end).
   int64_t (*count)(const Item* items, int row_bits, int64_t begin, int64_t end);
@@ -58,12 +83,20 @@ struct VoxelizeKernels {
 using WideItem = unsigned __int128;
 using VoxelizeF32 = VoxelizeKernels<float, uint64_t>;
 using VoxelizeF64 = VoxelizeKernels<double, uint64_t>;
+using VoxelizeBF16 = VoxelizeKernels<BFloat16, uint64_t>;
+using VoxelizeF16 = VoxelizeKernels<Float16, uint64_t>;
 using VoxelizeWideF32 = VoxelizeKernels<float, WideItem>;
 using VoxelizeWideF64 = VoxelizeKernels<double, WideItem>;
+using VoxelizeWideBF16 = VoxelizeKernels<BFloat16, WideItem>;
+using VoxelizeWideF16 = VoxelizeKernels<Float16, WideItem>;
 
 }  // namespace pred
 
 PRED_DECLARE_KERNELS(VoxelizeF32, voxelize_f32)
 PRED_DECLARE_KERNELS(VoxelizeF64, voxelize_f64)
+PRED_DECLARE_KERNELS(VoxelizeBF16, voxelize_bf16)
+PRED_DECLARE_KERNELS(VoxelizeF16, voxelize_f16)
 PRED_DECLARE_KERNELS(VoxelizeWideF32, voxelize_wide_f32)
 PRED_DECLARE_KERNELS(VoxelizeWideF64, voxelize_wide_f64)
+PRED_DECLARE_KERNELS(VoxelizeWideBF16, voxelize_wide_bf16)
+PRED_DECLARE_KERNELS(VoxelizeWideF16, voxelize_wide_f16)

@@ -8,9 +8,10 @@
 namespace pred::PRED_ISA {
 namespace {
 
-template <typename T, typename Item>
-static int64_t pack(const VoxelizePoints<T>& a, int64_t frame, int64_t begin, int64_t end, Item* items,
+template <typename S, typename Item>
+static int64_t pack(const VoxelizePoints<S>& a, int64_t frame, int64_t begin, int64_t end, Item* items,
                     int64_t* point_to_voxel) {
+  using T = Compute<S>;
   constexpr int64_t kChunk = 256;
   T value[3][kChunk];
   int32_t index[3][kChunk];
@@ -20,10 +21,10 @@ static int64_t pack(const VoxelizePoints<T>& a, int64_t frame, int64_t begin, in
     const int64_t size = end - start < kChunk ? end - start : kChunk;
     // Separate loops: the divisions below vectorise, the strided reads do not.
     for (int64_t i = 0; i < size; ++i) {
-      const T* point = a.points + (start + i) * a.point_stride;
-      value[0][i] = point[0];
-      value[1][i] = point[a.axis_stride];
-      value[2][i] = point[2 * a.axis_stride];
+      const S* point = a.points + (start + i) * a.point_stride;
+      value[0][i] = widen(point[0]);
+      value[1][i] = widen(point[a.axis_stride]);
+      value[2][i] = widen(point[2 * a.axis_stride]);
     }
     for (int axis = 0; axis < 3; ++axis) {
       const T low = a.grid.low[axis], high = a.grid.high[axis], edge = a.grid.size[axis];
@@ -45,11 +46,6 @@ static int64_t pack(const VoxelizePoints<T>& a, int64_t frame, int64_t begin, in
 }
 
 template <typename Item>
-static inline bool starts_voxel(const Item* items, int row_bits, int64_t i) {
-  return i == 0 || (items[i] ^ items[i - 1]) >> row_bits != 0;
-}
-
-template <typename Item>
 static int64_t count(const Item* items, int row_bits, int64_t begin, int64_t end) {
   int64_t voxels = 0;
   for (int64_t i = begin; i < end; ++i) voxels += starts_voxel(items, row_bits, i);
@@ -59,21 +55,15 @@ static int64_t count(const Item* items, int row_bits, int64_t begin, int64_t end
 template <typename Item>
 static void write(const Item* items, int64_t num_items, const VoxelKeyBits& bits, int64_t first_voxel, int64_t begin,
                   int64_t end, int64_t* coords, int64_t* counts, int64_t* point_to_voxel) {
-  const auto field = [](uint64_t value, int width) { return int64_t(value & ((uint64_t(1) << width) - 1)); };
   int64_t voxel = first_voxel - 1, voxel_begin = -1;
   for (int64_t i = begin; i < end; ++i) {
     if (starts_voxel(items, bits.row, i)) {
       if (voxel_begin >= 0) counts[voxel] = i - voxel_begin;
       ++voxel;
       voxel_begin = i;
-      const uint64_t key = uint64_t(items[i] >> bits.row);
-      int64_t* out = coords + 4 * voxel;
-      out[0] = int64_t(key >> (bits.x + bits.y + bits.z));
-      out[1] = field(key >> (bits.x + bits.y), bits.z);
-      out[2] = field(key >> bits.x, bits.y);
-      out[3] = field(key, bits.x);
+      write_coords(items[i], bits, coords + 4 * voxel);
     }
-    point_to_voxel[field(uint64_t(items[i]), bits.row)] = voxel;
+    point_to_voxel[item_row(items[i], bits)] = voxel;
   }
   if (voxel_begin < 0) return;
   int64_t voxel_end = end;
@@ -85,7 +75,11 @@ static void write(const Item* items, int64_t num_items, const VoxelKeyBits& bits
 
 const VoxelizeF32 voxelize_f32 = {pack<float, uint64_t>, count<uint64_t>, write<uint64_t>};
 const VoxelizeF64 voxelize_f64 = {pack<double, uint64_t>, count<uint64_t>, write<uint64_t>};
+const VoxelizeBF16 voxelize_bf16 = {pack<BFloat16, uint64_t>, count<uint64_t>, write<uint64_t>};
+const VoxelizeF16 voxelize_f16 = {pack<Float16, uint64_t>, count<uint64_t>, write<uint64_t>};
 const VoxelizeWideF32 voxelize_wide_f32 = {pack<float, WideItem>, count<WideItem>, write<WideItem>};
 const VoxelizeWideF64 voxelize_wide_f64 = {pack<double, WideItem>, count<WideItem>, write<WideItem>};
+const VoxelizeWideBF16 voxelize_wide_bf16 = {pack<BFloat16, WideItem>, count<WideItem>, write<WideItem>};
+const VoxelizeWideF16 voxelize_wide_f16 = {pack<Float16, WideItem>, count<WideItem>, write<WideItem>};
 
 }  // namespace pred::PRED_ISA

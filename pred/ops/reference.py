@@ -2,8 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The plain PyTorch references of all ops, under the ops' own names."""
 
+from pred.ops.ball_query import ball_query_reference as ball_query
 from pred.ops.composite_alpha import composite_alpha_reference as composite_alpha
 from pred.ops.composite_rays import composite_rays_reference as composite_rays
+from pred.ops.farthest_point_sample import farthest_point_sample_reference as farthest_point_sample
+from pred.ops.knn import knn_reference as knn
 from pred.ops.resample_rays import resample_rays_reference as resample_rays
 from pred.ops.sample_bev import sample_bev_reference as sample_bev
 from pred.ops.sample_bev import sample_bev_with_grad_reference as sample_bev_with_grad
@@ -13,10 +16,14 @@ from pred.ops.sample_volume import sample_volume_with_grad_reference as sample_v
 from pred.ops.sdf_to_alpha import sdf_to_alpha_reference as sdf_to_alpha
 from pred.ops.segment_reduce import segment_reduce_reference as segment_reduce
 from pred.ops.voxelize import voxelize_reference as voxelize
+from pred.ops.voxelize_hard import voxelize_hard_reference as voxelize_hard
 
 __all__ = [
+    "ball_query",
     "composite_alpha",
     "composite_rays",
+    "farthest_point_sample",
+    "knn",
     "resample_rays",
     "sample_bev",
     "sample_bev_with_grad",
@@ -26,4 +33,5 @@ __all__ = [
     "sdf_to_alpha",
     "segment_reduce",
     "voxelize",
+    "voxelize_hard",
 ]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, check_choice, check_dtype, check_shape, check_tensors, widen
+from pred.ops._check import FLOATING, HALF, check_choice, check_dtype, check_shape, check_tensors, widen
 
 
 def segment_reduce(
@@ -22,14 +22,14 @@ def segment_reduce(
     """Reduces rows by segment: ``out[s, c] = reduce over {i : index[i] = s} of features[i, c]``.
 
     Args:
-        features: ``[N, C]`` float32 or float64.
+        features: ``[N, C]`` float32, float64, bfloat16 or float16. Half precision is added up in float32.
         index: ``[N]`` int64 in [0, num_segments), in any order; rows with -1 are skipped.
         num_segments: rows of the output.
         reduce: ``"sum"``, ``"mean"`` or ``"max"``.
 
     Returns:
-        ``[num_segments, C]``; 0 for segments without rows. A NaN makes its segment and channel NaN, in ``"max"`` too
-        (as ``torch.amax``).
+        ``[num_segments, C]`` in the dtype of the features, rounded once; 0 for segments without rows. A NaN makes its
+        segment and channel NaN, in ``"max"`` too (as ``torch.amax``).
 
     Raises:
         ValueError: shape, device, ``reduce``, or an index outside [-1, num_segments) (checked for CPU tensors, before
@@ -53,17 +53,19 @@ def segment_reduce_reference(
 ) -> Tensor:  # [num_segments, C]
     """Plain PyTorch form of :func:`segment_reduce`, differentiable any number of times."""
     features = _arguments(features, index, num_segments, reduce)
+    dtype = features.dtype
+    features = features if dtype == torch.float64 else features.float()
     if not torch.compiler.is_compiling() and index.device.type == "cpu":
         _check_index(index, num_segments)
     # One more segment takes the skipped rows.
     segment = torch.where(index < 0, torch.full_like(index, num_segments), index)
     if reduce == "max":
-        return _max_reference(features, segment, num_segments)
+        return _max_reference(features, segment, num_segments).to(dtype)
     total = features.new_zeros(num_segments + 1, features.shape[1]).index_add(0, segment, features)[:-1]
     if reduce == "sum":
-        return total
+        return total.to(dtype)
     count = features.new_zeros(num_segments + 1).index_add(0, segment, features.new_ones(features.shape[0]))[:-1]
-    return total / count.clamp_min(1)[:, None]
+    return (total / count.clamp_min(1)[:, None]).to(dtype)
 
 
 def _arguments(features: Tensor, index: Tensor, num_segments: int, reduce: str) -> Tensor:
@@ -72,7 +74,7 @@ def _arguments(features: Tensor, index: Tensor, num_segments: int, reduce: str) 
     features = widen(features)
     check_shape(op, "features", features, ("N", "C"))
     check_shape(op, "index", index, (features.shape[0],), " as features")
-    check_dtype(op, "features", features, FLOATING)
+    check_dtype(op, "features", features, FLOATING + HALF)
     check_dtype(op, "index", index, (torch.int64,))
     check_choice(op, "reduce", reduce, ("sum", "mean", "max"))
     if index.device != features.device:

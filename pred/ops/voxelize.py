@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, check_dtype, check_shape, check_tensors
+from pred.ops._check import FLOATING, HALF, check_dtype, check_offsets, check_tensors
 
 _MAX_KEYS = 2**62
 _MAX_CELLS = 2**30
@@ -34,13 +34,14 @@ def voxelize(
 ) -> Voxels:
     """Finds the occupied voxels of a ragged batch of point clouds.
 
-    ``index = floor((p - min) / size)`` per axis, computed in the dtype of ``points`` (bounds and sizes are rounded to
-    it first). A point is inside when ``min <= p < max`` on all three axes; one just below ``max`` whose quotient
-    rounds up to the grid size belongs to the last voxel. NaN and infinite coordinates are outside.
+    ``index = floor((p - min) / size)`` per axis, computed in the dtype of ``points``, or float32 for half-precision
+    points (bounds and sizes are rounded to that dtype first). A point is inside when ``min <= p < max`` on all three
+    axes; one just below ``max`` whose quotient rounds up to the grid size belongs to the last voxel. NaN and infinite
+    coordinates are outside.
 
     Args:
-        points: ``[N, D]`` float32 or float64, D >= 3; the first three columns are x, y, z. Frame b owns the rows from
-            ``batch_offsets[b]`` up to ``batch_offsets[b + 1]``. Any strides.
+        points: ``[N, D]`` float32, float64, bfloat16 or float16, D >= 3; the first three columns are x, y, z. Frame b
+            owns the rows from ``batch_offsets[b]`` up to ``batch_offsets[b + 1]``. Any strides.
         batch_offsets: ``[B + 1]`` int64, ascending from 0 to N; frames may be empty.
         voxel_size: edge lengths (x, y, z), in the unit of the points.
         point_range: (x_min, y_min, z_min, x_max, y_max, z_max), same unit and frame as the points; each edge a whole
@@ -56,28 +57,7 @@ def voxelize(
 
     Not differentiable: the outputs are integers. Equal bits for any thread count and instruction set.
     """
-    check_tensors("voxelize", points=points, batch_offsets=batch_offsets)
-    if points.dim() != 2 or points.shape[1] < 3:
-        raise ValueError(f"voxelize: points must have shape [N, D] with D >= 3, got {list(points.shape)}")
-    check_dtype("voxelize", "points", points, FLOATING)
-    check_shape("voxelize", "batch_offsets", batch_offsets, ("B + 1",))
-    check_dtype("voxelize", "batch_offsets", batch_offsets, (torch.int64,))
-    if batch_offsets.device != points.device:
-        raise ValueError(
-            f"voxelize: batch_offsets must be on the device of points ({points.device}), got {batch_offsets.device}"
-        )
-    if batch_offsets.shape[0] == 0:
-        raise ValueError("voxelize: batch_offsets must have shape [B + 1] with B >= 0, got [0]")
-    size, bounds = _floats("voxel_size", voxel_size, 3), _floats("point_range", point_range, 6)
-    grid = _grid_size(size, bounds)
-    frame_keys = math.prod([1 << (cells - 1).bit_length() for cells in grid])
-    if batch_offsets.shape[0] - 1 > _MAX_KEYS // frame_keys:
-        raise ValueError(
-            f"voxelize: point_range / voxel_size must give B nz ny nx <= 2^62 (edges rounded up to powers of two), "
-            f"got a grid of {grid[0]} x {grid[1]} x {grid[2]} for {batch_offsets.shape[0] - 1} frames"
-        )
-    if not torch.compiler.is_compiling() and batch_offsets.device.type == "cpu":
-        _check_offsets(batch_offsets, points.shape[0])
+    size, bounds, grid = check_voxelize_arguments("voxelize", points, batch_offsets, voxel_size, point_range)
     if _native.use_native("voxelize", points):
         return Voxels(*torch.ops.pred.voxelize(points, batch_offsets, size, bounds, grid))
     return voxelize_reference(points, batch_offsets, size, bounds)
@@ -90,13 +70,14 @@ def voxelize_reference(
     point_range: Sequence[float],
 ) -> Voxels:
     """Plain PyTorch form of :func:`voxelize`: ``torch.unique`` of linear voxel numbers."""
-    nx, ny, nz = _grid_size(voxel_size, point_range)
+    nx, ny, nz = _grid_size("voxelize", voxel_size, point_range)
     xyz = points.detach()[:, :3]
-    low, high = points.new_tensor(point_range[:3]), points.new_tensor(point_range[3:])
+    xyz = xyz if xyz.dtype == torch.float64 else xyz.float()
+    low, high = xyz.new_tensor(point_range[:3]), xyz.new_tensor(point_range[3:])
     inside = ((xyz >= low) & (xyz < high)).all(dim=1)
-    quotient = (xyz - low) / points.new_tensor(voxel_size)
+    quotient = (xyz - low) / xyz.new_tensor(voxel_size)
     cells = torch.tensor([nx, ny, nz], device=points.device)
-    below = quotient < cells.to(points.dtype)
+    below = quotient < cells.to(xyz.dtype)
     cell = torch.where(inside[:, None] & below, quotient, torch.zeros_like(quotient)).long()
     cell = torch.where(below, cell, cells - 1)
     row = torch.arange(points.shape[0], device=points.device)
@@ -109,41 +90,56 @@ def voxelize_reference(
     return Voxels(coords, point_to_voxel, counts)
 
 
-def _floats(name: str, values: Sequence[float], count: int) -> list[float]:
+def check_voxelize_arguments(
+    op: str,
+    points: Tensor,
+    batch_offsets: Tensor,
+    voxel_size: Sequence[float],
+    point_range: Sequence[float],
+) -> tuple[list[float], list[float], list[int]]:
+    """Voxel size, range and grid size (x, y, z) after all checks."""
+    check_tensors(op, points=points, batch_offsets=batch_offsets)
+    if points.dim() != 2 or points.shape[1] < 3:
+        raise ValueError(f"{op}: points must have shape [N, D] with D >= 3, got {list(points.shape)}")
+    check_dtype(op, "points", points, FLOATING + HALF)
+    check_offsets(op, "batch_offsets", batch_offsets, "BN", "points", points)
+    size, bounds = _floats(op, "voxel_size", voxel_size, 3), _floats(op, "point_range", point_range, 6)
+    grid = _grid_size(op, size, bounds)
+    frame_keys = math.prod([1 << (cells - 1).bit_length() for cells in grid])
+    if batch_offsets.shape[0] - 1 > _MAX_KEYS // frame_keys:
+        raise ValueError(
+            f"{op}: point_range / voxel_size must give B nz ny nx <= 2^62 (edges rounded up to powers of two), "
+            f"got a grid of {grid[0]} x {grid[1]} x {grid[2]} for {batch_offsets.shape[0] - 1} frames"
+        )
+    return size, bounds, grid
+
+
+def _floats(op: str, name: str, values: Sequence[float], count: int) -> list[float]:
     floats = [float(value) for value in values]
     if len(floats) != count or not all(math.isfinite(value) for value in floats):
-        raise ValueError(f"voxelize: {name} must hold {count} finite numbers, got {floats}")
+        raise ValueError(f"{op}: {name} must hold {count} finite numbers, got {floats}")
     return floats
 
 
-def _grid_size(voxel_size: Sequence[float], point_range: Sequence[float]) -> list[int]:
+def _grid_size(op: str, voxel_size: Sequence[float], point_range: Sequence[float]) -> list[int]:
     """Voxels along x, y, z."""
     grid = []
     for axis, name in enumerate("xyz"):
         size, low, high = voxel_size[axis], point_range[axis], point_range[axis + 3]
         if not size > 0:
-            raise ValueError(f"voxelize: voxel_size must be positive, got {size} along {name}")
+            raise ValueError(f"{op}: voxel_size must be positive, got {size} along {name}")
         if not low < high:
-            raise ValueError(f"voxelize: point_range must have min < max, got {low} and {high} along {name}")
+            raise ValueError(f"{op}: point_range must have min < max, got {low} and {high} along {name}")
         cells = (high - low) / size
         if cells > _MAX_CELLS:
-            raise ValueError(
-                f"voxelize: voxel_size must give at most 2^30 voxels per axis, got {cells:.6g} along {name}"
-            )
+            raise ValueError(f"{op}: voxel_size must give at most 2^30 voxels per axis, got {cells:.6g} along {name}")
         if round(cells) == 0 or abs(cells - round(cells)) > 1e-3:
             raise ValueError(
-                f"voxelize: point_range must be a whole multiple of voxel_size, got {cells:.6g} voxels "
+                f"{op}: point_range must be a whole multiple of voxel_size, got {cells:.6g} voxels "
                 f"({low} to {high} in steps of {size}) along {name}"
             )
         grid.append(round(cells))
     return grid
-
-
-def _check_offsets(batch_offsets: Tensor, num_points: int) -> None:
-    offsets = batch_offsets.tolist()
-    if offsets[0] != 0 or offsets[-1] != num_points or any(a > b for a, b in zip(offsets, offsets[1:], strict=False)):
-        shown = str(offsets) if len(offsets) <= 16 else f"{offsets[:8]} ... {offsets[-1]}"
-        raise ValueError(f"voxelize: batch_offsets must ascend from 0 to N={num_points}, got {shown}")
 
 
 def _fake(

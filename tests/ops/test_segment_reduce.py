@@ -101,8 +101,35 @@ def test_native_equals_reference(
 
 
 @pytest.mark.parametrize("reduce", REDUCTIONS)
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("rows,channels,segments", [(500, 67, 90), (900, 3, 2000), (1, 1, 1), (0, 4, 3), (64, 0, 4)])
+def test_half_storage_is_float32_rounded_once(
+    level: str, rows: int, channels: int, segments: int, dtype: torch.dtype, reduce: str
+) -> None:
+    features, index = case(rows, channels, segments, dtype)
+    out, first, second = gradients(segment_reduce, features, index, segments, reduce)
+    assert out.dtype == first.dtype == second.dtype == dtype
+    # Both add the rows of a segment in their order, in float32.
+    assert torch.equal(out, segment_reduce(features.float(), index, segments, reduce).to(dtype))
+    expected = gradients(reference.segment_reduce, features, index, segments, reduce)
+    assert torch.equal(first, expected[1])
+    # One rounding to half precision, of a sum in another order.
+    assert_close(out.double(), expected[0].double(), torch.finfo(dtype).eps)
+    assert_close(second.double(), expected[2].double(), 2 * torch.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_sums_of_many_half_rows_lose_nothing(backend: str, dtype: torch.dtype) -> None:
+    features, index = torch.ones(20000, 3, dtype=dtype), torch.zeros(20000, dtype=torch.int64)
+    assert segment_reduce(features, index, 1, "sum").tolist() == [[torch.tensor(20000.0).to(dtype).item()] * 3]
+    features[1:] *= 2.0**-9
+    mean = (1 + 19999 * 2.0**-9) / 20000
+    assert segment_reduce(features, index, 1, "mean").tolist() == [[torch.tensor(mean).to(dtype).item()] * 3]
+
+
+@pytest.mark.parametrize("reduce", REDUCTIONS)
 def test_levels_agree_bitwise(level: str, monkeypatch: pytest.MonkeyPatch, reduce: str) -> None:
-    for dtype in (torch.float32, torch.float64):
+    for dtype in (torch.float32, torch.float64, torch.bfloat16, torch.float16):
         features, index = case(3000, 67, 400, dtype)
         actual = gradients(segment_reduce, features, index, 400, reduce)
         monkeypatch.setenv("PRED_CPU_CAPABILITY", "default")
@@ -112,8 +139,9 @@ def test_levels_agree_bitwise(level: str, monkeypatch: pytest.MonkeyPatch, reduc
 
 
 @pytest.mark.parametrize("reduce", REDUCTIONS)
-def test_bitwise_equal_for_any_thread_count(native: None, reduce: str) -> None:
-    features, index = case(20000, 19, 3000, torch.float32)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_bitwise_equal_for_any_thread_count(native: None, dtype: torch.dtype, reduce: str) -> None:
+    features, index = case(20000, 19, 3000, dtype)
     index[5000:12000] = 77  # one long segment
     results = []
     for threads in (1, 2, 7):
@@ -184,8 +212,8 @@ def test_errors(backend: str) -> None:
         segment_reduce(features[:, 0], index, 12)
     with pytest.raises(ValueError, match=r"segment_reduce: index must have shape \[40\] as features, got \[39\]"):
         segment_reduce(features, index[1:], 12)
-    with pytest.raises(TypeError, match="segment_reduce: features must be float32 or float64, got bfloat16"):
-        segment_reduce(features.bfloat16(), index, 12)
+    with pytest.raises(TypeError, match="segment_reduce: features must be float32 or .* or float16, got int64"):
+        segment_reduce(features.long(), index, 12)
     with pytest.raises(TypeError, match="segment_reduce: index must be int64, got int32"):
         segment_reduce(features, index.int(), 12)
     with pytest.raises(ValueError, match="segment_reduce: reduce must be one of sum, mean, max, got 'min'"):
@@ -206,8 +234,8 @@ def test_direct_calls_are_checked(native: None) -> None:
     backward = torch.ops.pred.segment_reduce_backward
     with pytest.raises(ValueError, match=r"segment_reduce: index must have shape \[40\], got \[3\]"):
         torch.ops.pred.segment_reduce(features, index[:3], 12, "sum")
-    with pytest.raises(ValueError, match="segment_reduce: dtype must be float32 or float64"):
-        torch.ops.pred.segment_reduce(features.half(), index, 12, "sum")
+    with pytest.raises(ValueError, match="segment_reduce: dtype must be float32, float64, bfloat16 or float16"):
+        torch.ops.pred.segment_reduce(features.long(), index, 12, "sum")
     with pytest.raises(ValueError, match=r"index must lie in \[-1, num_segments=11\)"):
         backward(features[:11], torch.full((4,), 11), torch.empty(0, dtype=torch.int32), "sum")
     with pytest.raises(ValueError, match=r"saved must belong to grad of shape \[12, 5\], got \[12, 4\]"):

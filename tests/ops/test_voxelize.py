@@ -108,6 +108,16 @@ def test_quotient_that_rounds_up_to_the_grid_size(backend: str, dtype: torch.dty
     assert voxelize(upper, torch.tensor([0, 1]), (size,) * 3, (low,) * 3 + (high,) * 3).point_to_voxel.tolist() == [-1]
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_points_of_half_precision_are_compared_in_float32(level: str, dtype: torch.dtype) -> None:
+    points, offsets = cloud(3000, dtype=dtype), torch.tensor([0, 1000, 3000])
+    for size, point_range in [*zip(SIZES, RANGES, strict=True), ((0.0001,) * 3, RANGE)]:
+        expected = reference.voxelize(points.float(), offsets, size, point_range)
+        assert same(voxelize(points, offsets, size, point_range), expected)
+        assert same(voxelize(points.t().contiguous().t(), offsets, size, point_range), expected)
+        assert same(reference.voxelize(points, offsets, size, point_range), expected)
+
+
 def test_awkward_coordinates_at_every_level(level: str) -> None:
     values = [
         math.nan,
@@ -204,8 +214,8 @@ def test_errors(backend: str) -> None:
     points, offsets = cloud(10), torch.tensor([0, 10])
     with pytest.raises(ValueError, match=r"voxelize: points must have shape \[N, D\] with D >= 3, got \[10, 2\]"):
         voxelize(points[:, :2], offsets, SIZES[0], RANGE)
-    with pytest.raises(TypeError, match="voxelize: points must be float32 or float64, got float16"):
-        voxelize(points.half(), offsets, SIZES[0], RANGE)
+    with pytest.raises(TypeError, match="voxelize: points must be float32 or .* or float16, got int64"):
+        voxelize(points.long(), offsets, SIZES[0], RANGE)
     with pytest.raises(TypeError, match="voxelize: batch_offsets must be int64, got int32"):
         voxelize(points, offsets.int(), SIZES[0], RANGE)
     with pytest.raises(ValueError, match=r"voxelize: batch_offsets must have shape \[B \+ 1\], got \[1, 2\]"):

@@ -1,0 +1,105 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// What the bindings of voxelize and voxelize_hard share: checked arguments, and points sorted by voxel.
+#pragma once
+
+#include <vector>
+
+#include "common/check.h"
+#include "common/clouds.h"
+#include "common/parallel.h"
+#include "common/radix_sort.h"
+#include "ops/voxelize.h"
+
+namespace pred {
+
+template <typename S, typename Item>
+const VoxelizeKernels<S, Item>& voxelize_kernels() {
+  constexpr bool wide = !std::is_same_v<Item, uint64_t>;
+  if constexpr (std::is_same_v<S, float>)
+    if constexpr (wide)
+      return PRED_KERNELS(voxelize_wide_f32);
+    else
+      return PRED_KERNELS(voxelize_f32);
+  else if constexpr (std::is_same_v<S, double>)
+    if constexpr (wide)
+      return PRED_KERNELS(voxelize_wide_f64);
+    else
+      return PRED_KERNELS(voxelize_f64);
+  else if constexpr (std::is_same_v<S, BFloat16>)
+    if constexpr (wide)
+      return PRED_KERNELS(voxelize_wide_bf16);
+    else
+      return PRED_KERNELS(voxelize_bf16);
+  else if constexpr (wide)
+    return PRED_KERNELS(voxelize_wide_f16);
+  else
+    return PRED_KERNELS(voxelize_f16);
+}
+
+struct VoxelizeInputs {
+  Tensor points;   // [N, D]
+  Tensor offsets;  // [B + 1], contiguous
+  std::vector<double> voxel_size, point_range;
+  std::vector<int64_t> grid_size;
+  VoxelKeyBits bits;
+  int key_bits;
+
+  VoxelizeInputs(const char* op, const Tensor& points, const Tensor& batch_offsets, std::vector<double> voxel_size,
+                 std::vector<double> point_range, std::vector<int64_t> grid_size)
+      : points(points), voxel_size(voxel_size), point_range(point_range), grid_size(grid_size) {
+    check_cpu_tensor(op, "points", points, 2, points.scalar_type());
+    PRED_CHECK(points.size(1) >= 3, op, ": points must have shape [N, D] with D >= 3, got ", shape_text(points));
+    PRED_CHECK(voxel_size.size() == 3 && point_range.size() == 6 && grid_size.size() == 3, op,
+               ": voxel_size, point_range and grid_size must hold 3, 6 and 3 numbers, got ", voxel_size.size(), ", ",
+               point_range.size(), " and ", grid_size.size());
+    for (const int64_t cells : grid_size) {
+      PRED_CHECK(cells >= 1 && cells <= int64_t(1) << 30, op, ": grid_size must lie in [1, 2^30], got ", cells);
+    }
+    offsets = frame_offsets(op, "batch_offsets", batch_offsets, 'N', num_points());
+    bits = {bits_for(grid_size[0]), bits_for(grid_size[1]), bits_for(grid_size[2]), bits_for(num_points())};
+    key_bits = bits_for(num_frames()) + bits.x + bits.y + bits.z;
+    PRED_CHECK(key_bits <= 62, op, ": the frames' grids must have at most 2^62 voxels");
+  }
+
+  int64_t num_points() const { return points.size(0); }
+  int64_t num_frames() const { return offsets.size(0) - 1; }
+
+  template <typename S>
+  VoxelizePoints<S> arguments() const {
+    using T = Compute<S>;
+    VoxelizePoints<S> a{storage<S>(points), points.stride(0), points.stride(1), {}, bits};
+    for (int axis = 0; axis < 3; ++axis) {
+      a.grid.low[axis] = T(point_range[axis]);
+      a.grid.high[axis] = T(point_range[axis + 3]);
+      a.grid.size[axis] = T(voxel_size[axis]);
+      a.grid.cells[axis] = int32_t(grid_size[axis]);
+    }
+    return a;
+  }
+};
+
+template <typename S, typename Item>
+SortedItems<Item> sort_by_voxel(const VoxelizeInputs& in, const VoxelizePoints<S>& a, int64_t* point_to_voxel) {
+  const auto& k = voxelize_kernels<S, Item>();
+  const int64_t* offset = in.offsets.const_data_ptr<int64_t>();
+  return sort_rows<Item>(in.num_points(), a.bits.row, in.key_bits, [&](Item* items, int64_t begin, int64_t end) {
+    int64_t packed = 0;
+    for_each_frame(offset, in.num_frames(), begin, end, [&](int64_t frame, int64_t first, int64_t last) {
+      packed += k.pack(a, frame, first, last, items + packed, point_to_voxel);
+    });
+    return packed;
+  });
+}
+
+// Calls body(arguments, items) with the points inside, sorted by voxel and then by row. point_to_voxel gets -1 for the
+// points outside.
+template <typename S, class Body>
+auto with_sorted_points(const VoxelizeInputs& in, int64_t* point_to_voxel, const Body& body) {
+  const VoxelizePoints<S> a = in.arguments<S>();
+  if (in.key_bits + in.bits.row <= 64) return body(a, sort_by_voxel<S, uint64_t>(in, a, point_to_voxel));
+  return body(a, sort_by_voxel<S, WideItem>(in, a, point_to_voxel));
+}
+
+}  // namespace pred
