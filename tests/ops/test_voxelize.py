@@ -198,9 +198,8 @@ def test_opcheck(native: None, num_points: int) -> None:
     torch.library.opcheck(torch.ops.pred.voxelize.default, (*arguments, [512, 512, 1]))
 
 
-def test_compiles_to_one_graph(native: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch._dynamo.config, "capture_dynamic_output_shape_ops", True)
-
+@torch._dynamo.config.patch(capture_dynamic_output_shape_ops=True)
+def test_compiles_to_one_graph(native: None) -> None:
     def mean_per_pillar(points: Tensor, offsets: Tensor) -> Tensor:
         voxels = voxelize(points, offsets, SIZES[1], RANGE)
         return segment_reduce(points, voxels.point_to_voxel, voxels.coords.shape[0], "mean")
