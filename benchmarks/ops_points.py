@@ -84,9 +84,8 @@ def _voxelize_hard_cases(sizes: Sizes) -> list[Case]:
     points = cases.lidar_points(sizes.points)
     columns, size = points.shape[1], (sizes.voxel_m,) * 3
     limits = (sizes.voxel_points, sizes.max_voxels)
-    arguments = (size, cases.POINT_RANGE_M, *limits)
     inputs = (points, torch.tensor([0, sizes.points]))
-    voxels = reference.voxelize_hard(*inputs, *arguments).voxels
+    voxels = reference.voxelize_hard(*inputs, size, cases.POINT_RANGE_M, *limits).voxels
     forward = points.nbytes + voxels.nbytes + 40 * len(voxels)
     return [
         Case(
@@ -95,8 +94,10 @@ def _voxelize_hard_cases(sizes: Sizes) -> list[Case]:
             unit="points",
             items=sizes.points,
             inputs=inputs,
-            ours=lambda points, offsets: ops.voxelize_hard(points, offsets, *arguments),
-            reference=lambda points, offsets: reference.voxelize_hard(points, offsets, *arguments),
+            ours=lambda points, offsets: ops.voxelize_hard(points, offsets, size, cases.POINT_RANGE_M, *limits),
+            reference=lambda points, offsets: reference.voxelize_hard(
+                points, offsets, size, cases.POINT_RANGE_M, *limits
+            ),
             eager={"sort": Variant(lambda points, offsets: _eager_voxelize_hard(points, offsets, size, *limits))},
             compiled=("sort",),
             derivative_in=(0,),
@@ -105,7 +106,7 @@ def _voxelize_hard_cases(sizes: Sizes) -> list[Case]:
                 Phase(FORWARD, "4 N D + 4 M P D + 40 M", forward, (Target("peer", 2),)),
                 Phase(BACKWARD, "8 N D + 8 M P D + 40 M", forward + points.nbytes + voxels.nbytes),
             ),
-            peers=peers.voxelize_hard(columns, *arguments),
+            peers=peers.voxelize_hard(columns, size, cases.POINT_RANGE_M, *limits),
         )
     ]
 
@@ -181,8 +182,12 @@ def _knn_cases(sizes: Sizes) -> list[Case]:
             items=sizes.samples,
             inputs=inputs,
             # Only distances are compared: of points equally far others may be chosen.
-            ours=lambda *inputs: (ops.knn(*inputs, k).squared_distance,),
-            reference=lambda *inputs: (reference.knn(*inputs, k).squared_distance,),
+            ours=lambda points, frame, queries, query_frame: (
+                ops.knn(points, frame, queries, query_frame, k).squared_distance,
+            ),
+            reference=lambda points, frame, queries, query_frame: (
+                reference.knn(points, frame, queries, query_frame, k).squared_distance,
+            ),
             eager={
                 name: Variant(lambda points, _, queries, __, mode=mode: (_eager_knn(points, queries, k, mode),))
                 for name, mode in _CDIST.items()
@@ -220,8 +225,12 @@ def _ball_query_cases(sizes: Sizes) -> list[Case]:
             unit="queries",
             items=sizes.samples,
             inputs=inputs,
-            ours=lambda *inputs: ops.ball_query(*inputs, radius_m, count),
-            reference=lambda *inputs: reference.ball_query(*inputs, radius_m, count),
+            ours=lambda points, frame, queries, query_frame: ops.ball_query(
+                points, frame, queries, query_frame, radius_m, count
+            ),
+            reference=lambda points, frame, queries, query_frame: reference.ball_query(
+                points, frame, queries, query_frame, radius_m, count
+            ),
             eager={
                 "cdist, topk": Variant(lambda points, _, queries, __: _eager_ball(points, queries, radius_m, count))
             },

@@ -240,9 +240,8 @@ def test_opcheck(native: None, num_points: int) -> None:
     torch.library.opcheck(torch.ops.pred.voxelize_hard_backward.default, (grad, slots))
 
 
-def test_compiles_to_one_graph(native: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch._dynamo.config, "capture_dynamic_output_shape_ops", True)
-
+@torch._dynamo.config.patch(capture_dynamic_output_shape_ops=True)
+def test_compiles_to_one_graph(native: None) -> None:
     def mean_per_voxel(points: Tensor, offsets: Tensor) -> Tensor:
         found = voxelize_hard(points, offsets, SIZES[1], RANGE, 4, 50)
         return found.voxels.sum(dim=1) / found.counts[:, None]
