@@ -41,7 +41,7 @@ def _load() -> str | None:
     try:
         torch.ops.load_library(str(_LIBRARY))
     except (OSError, RuntimeError) as error:
-        return f"{_LIBRARY.name} does not load: {error}"
+        return f"{_LIBRARY.name} does not load: {error.__cause__ or error}"  # the cause is the linker's own text
     return None
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import faulthandler
 import json
 import os
 import random
@@ -158,6 +159,8 @@ def _dtype(rng: random.Random, tensor: Tensor) -> Tensor:
 
 
 def _kind(rng: random.Random, tensor: Tensor) -> Any:
+    if max(tensor.shape, default=0) > 1e6:  # to_sparse() of an empty tensor takes as long as its sizes are large
+        return tensor
     change = rng.choice(["meta", "sparse", "numpy", "list", "parameter", "conjugate", "inference"])
     if change == "meta":
         return tensor.to("meta")
@@ -265,7 +268,9 @@ def shapes(result: dict[str, Tensor]) -> dict[str, Any]:
 class Fuzzer:
     """Makes call number ``seed`` and judges it."""
 
-    def __init__(self) -> None:
+    def __init__(self, announce: Callable[[str], None]) -> None:
+        """``announce`` gets the text of each call before it is made."""
+        self.announce = announce
         with backend("native"):
             self.direct = recorded_calls()
         self.direct["parallel_probe"] = [(torch.zeros(8, dtype=torch.int64), 1, -1)]
@@ -276,17 +281,15 @@ class Fuzzer:
         rng = random.Random(seed)
         target = rng.choice(self.targets)
         torch.manual_seed(0)
-        try:
-            return self.call_public(rng, target) if isinstance(target, Example) else self.call_direct(rng, target)
-        except FindingError as finding:
-            raise FindingError(f"{self.text}\n{finding}") from finding
+        return self.call_public(rng, target) if isinstance(target, Example) else self.call_direct(rng, target)
 
     def call_public(self, rng: random.Random, example: Example) -> str:
         arguments = example.arguments(RandomSource(rng), rng.choice([torch.float32, torch.float32, torch.float64]))
         for _ in range(rng.choice([0, 1, 1, 1, 2, 3])):
             name = rng.choice(list(arguments))
             arguments[name] = mutate(rng, arguments[name])
-        self.text = f"pred.ops.{example.op}(" + ", ".join(f"{k}={describe(v)}" for k, v in arguments.items()) + ")"
+        shown = ", ".join(f"{name}={describe(value)}" for name, value in arguments.items())
+        self.announce(f"pred.ops.{example.op}({shown})")
         tensors = [value for value in arguments.values() if isinstance(value, Tensor)]
         leaves = [
             x for x in tensors if x.is_floating_point() and x.numel() < 1e6 and x.is_leaf and not x.is_inference()
@@ -341,7 +344,7 @@ class Fuzzer:
         for _ in range(rng.choice([0, 1, 1, 1, 2, 3])):
             at = rng.randrange(len(values))
             values[at] = mutate(rng, values[at])
-        self.text = f"torch.ops.pred.{name}(" + ", ".join(describe(value) for value in values) + ")"
+        self.announce(f"torch.ops.pred.{name}(" + ", ".join(describe(value) for value in values) + ")")
         op = getattr(torch.ops.pred, name)
         result, error = attempt(lambda: op(*values))
         if error is not None:
@@ -384,11 +387,11 @@ def child(first: int, last: int) -> None:
     """Makes the calls; a line on stdout before each (``call``), and what came of it."""
     warnings.simplefilter("ignore")
     torch.set_num_threads(2)
-    fuzzer = Fuzzer()
+    fuzzer = Fuzzer(lambda text: print("call", json.dumps(text), flush=True))
     limit_memory()
+    faulthandler.enable()
     for seed in range(first, last):
-        print("call", seed, flush=True)
-        signal.alarm(SECONDS_PER_CALL)  # ends the process, wherever it is
+        faulthandler.dump_traceback_later(SECONDS_PER_CALL, exit=True)  # wherever it is
         try:
             print("done", fuzzer.run(seed), flush=True)
         except FindingError as finding:
@@ -419,15 +422,16 @@ class Run:
                     text=True,
                 )
                 assert process.stdout is not None
-                began = False
+                text = ""
                 for line in process.stdout:
                     word, _, rest = line.rstrip("\n").partition(" ")
-                    began = True
                     if word == "done":
                         self.counts[rest] += 1
                     elif word == "finding":
-                        self.add(json.loads(rest))
-                    if word != "call":
+                        self.add(f"{text}\n{json.loads(rest)}")
+                    if word == "call":
+                        text = json.loads(rest)
+                    else:
                         self.next += 1
                     self.show(end, calls)
                     if time.monotonic() >= end:
@@ -436,11 +440,10 @@ class Run:
                 if code != 0 and time.monotonic() < end:
                     stderr.seek(0)
                     tail = stderr.read()[-6000:]
-                    if not began:
+                    if not text:
                         raise SystemExit(f"the child did not start (exit status {code}):\n{tail}")
                     name = signal.Signals(-code).name if code < 0 else f"exit status {code}"
-                    late = f", which ends a call after {SECONDS_PER_CALL} s" if name == "SIGALRM" else ""
-                    self.add(f"the process died ({name}{late})\n{tail}")
+                    self.add(f"{text}\nthe process died ({name}; a call may take {SECONDS_PER_CALL} s)\n{tail}")
                     self.next += 1
 
     def add(self, text: str) -> None:
@@ -490,12 +493,11 @@ def main() -> int:
         print(f"nothing to fuzz: {status['reason']}", file=sys.stderr)
         return 2
     if options.only is not None:
-        signal.alarm(5 * SECONDS_PER_CALL)
         warnings.simplefilter("ignore")
-        fuzzer = Fuzzer()
+        fuzzer = Fuzzer(lambda text: print(text, flush=True))
         limit_memory()
         try:
-            print(fuzzer.run(options.only), fuzzer.text)
+            print(fuzzer.run(options.only))
         except FindingError as finding:
             print(finding)
             return 1

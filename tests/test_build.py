@@ -95,6 +95,7 @@ def test_undefined_symbols_are_stable(build: Path) -> None:
     assert any(name.startswith("aoti_torch_") for name in names)
     cxx_torch = [name for name in names if re.match(r"_ZN?K?\d*(2at|3c10|5torch)", name)]
     assert cxx_torch == []
+    assert not [name for name in names if re.match(r"_ZN?K?4pred", name)]  # all of ours is in it
     needed = run("readelf", "-d", str(build / "libpred_cpu.so")).stdout
     libraries = set(re.findall(r"NEEDED.*\[(.*)\]", needed))
     assert not [name for name in libraries if "gomp" in name or "python" in name or "cuda" in name]

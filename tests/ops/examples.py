@@ -59,10 +59,10 @@ class Source:
         inner = self.integers(0, total + 1, parts - 1).sort().values
         return torch.cat([torch.tensor([0]), inner, torch.tensor([total])])
 
-    def dyadic(self, low: float, high: float, *shape: int) -> Tensor:
-        """Multiples of 1/1024: times a small whole number they are exact in float32 too, so that a position falls into
-        the same cell, on the same side of a kink, in every dtype."""
-        return self.integers(round(1024 * low), round(1024 * high) + 1, *shape).double() / 1024
+    def dyadic(self, low: float, high: float, *shape: int, parts: int = 1024) -> Tensor:
+        """Multiples of 1 / parts: products with small whole numbers are exact in float32 too, so that a position falls
+        into the same cell, on the same side of a kink, in every dtype."""
+        return self.integers(round(parts * low), round(parts * high) + 1, *shape).double() / parts
 
 
 @dataclass(frozen=True)
@@ -198,13 +198,41 @@ def _segment_reduce(source: Source) -> Arguments:
     }
 
 
-def _voxelize(source: Source) -> Arguments:
+def _clouds(source: Source, frames: int) -> Arguments:
+    """Squared distances are exact in float32; many are equal."""
     return {
-        "points": source.uniform(-5, 45, source.count, source.size(4, 3, 6)),
-        "batch_offsets": source.offsets(source.count, source.size(3, 1, 5)),
-        "voxel_size": (0.5, 0.25, 8.0),
-        "point_range": (0.0, 0.0, 0.0, 40.0, 40.0, 40.0),
+        "points": source.dyadic(-1, 9, source.count, source.size(4, 3, 6), parts=16),
+        "batch_offsets": source.offsets(source.count, frames),
     }
+
+
+def _voxelize(source: Source) -> Arguments:
+    edges = {"voxel_size": (0.5, 0.25, 2.0), "point_range": (0.0, 0.0, 0.0, 8.0, 8.0, 8.0)}
+    return _clouds(source, source.size(3, 1, 5)) | edges
+
+
+def _voxelize_hard(source: Source) -> Arguments:
+    limits = {"max_points": source.size(2, 1, 4), "max_voxels": source.size(30, 1, 60)}
+    return _voxelize(source) | limits
+
+
+def _farthest_point_sample(source: Source) -> Arguments:
+    return _clouds(source, source.size(3, 1, 5)) | {"num_samples": source.size(9, 0, 30)}
+
+
+def _queries(source: Source) -> Arguments:
+    frames, count = source.size(3, 1, 5), source.count // 4
+    cloud = _clouds(source, frames)
+    queries = source.dyadic(-1, 9, count, cloud["points"].shape[1], parts=16)
+    return cloud | {"queries": queries, "query_offsets": source.offsets(count, frames)}
+
+
+def _knn(source: Source) -> Arguments:
+    return _queries(source) | {"k": source.size(5, 0, 20)}
+
+
+def _ball_query(source: Source) -> Arguments:
+    return _queries(source) | {"radius": 2.5, "max_points": source.size(6, 0, 20)}
 
 
 def _rays(source: Source) -> Arguments:
@@ -320,6 +348,8 @@ _RAYS: dict[str, Any] = {
 # A rounding of the cumulative distribution moves a sample by 1e-7 / weight along its section.
 _PDF: dict[str, Any] = {"order": 0, "tolerance": 20}
 
+_CLOUDS: dict[str, Any] = {"features": ("points", "queries"), "reference_compiles": False}
+
 EXAMPLES = [
     *_examples("sample_bev", _sample_bev, *_PADDINGS, order=2, **_BEV),
     *_examples("sample_bev_with_grad", _sample_bev, *_PADDINGS, **_BEV),
@@ -330,11 +360,16 @@ EXAMPLES = [
         _segment_reduce,
         *({"reduce": reduce} for reduce in ("sum", "mean", "max")),
         differentiable=("features",),
+        features=("features",),
         order=None,
         tolerance=4,  # a sum of n rows carries the rounding of n additions
         many=20000,
     ),
-    *_examples("voxelize", _voxelize, order=0, many=70000, reference_compiles=False),
+    *_examples("voxelize", _voxelize, order=0, many=70000, **_CLOUDS),
+    *_examples("voxelize_hard", _voxelize_hard, differentiable=("points",), order=None, many=70000, **_CLOUDS),
+    *_examples("farthest_point_sample", _farthest_point_sample, {}, {"start": 4}, order=0, many=9000, **_CLOUDS),
+    *_examples("knn", _knn, order=0, **_CLOUDS),
+    *_examples("ball_query", _ball_query, order=0, **_CLOUDS),
     *_examples("sdf_to_alpha", _pair, {}, {"last": "opaque"}, {"inv_s": 2.7}, differentiable=("sdf", "inv_s")),
     *_examples(
         "sdf_to_alpha",

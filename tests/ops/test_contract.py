@@ -139,8 +139,6 @@ def test_autocast_computes_in_float32(backend: str, example: Example) -> None:
     """Half-precision arguments of a half-precision region are widened: the results are those of float32."""
     exact = example.example(37)
     rounded = {k: v.bfloat16() if isinstance(v, Tensor) and v.is_floating_point() else v for k, v in exact.items()}
-    if example.op == "voxelize":  # points are not rounded by autocast: nothing flows through them
-        rounded = exact
     wide = {k: v.float() if isinstance(v, Tensor) and v.is_floating_point() else v for k, v in rounded.items()}
     leaves, order = example.leaves(exact), min(order_of(example), 1)
     expected = evaluate(example.native, wide, leaves, order)
@@ -243,7 +241,7 @@ def test_empty(backend: str, example: Example) -> None:
     leaves, order = example.leaves(arguments), order_of(example)
     actual = evaluate(example.native, arguments, leaves, order)
     assert_same_bits(actual, evaluate(example.reference, arguments, leaves, order))
-    assert all(not value.any() for value in actual.values())
+    assert all(not value.any() or (value == -1).all() for value in actual.values())  # -1: no such row
     like_full = evaluate(example.native, example.example(3), leaves, order)
     for name, value in actual.items():
         assert value.dim() == like_full[name].dim() and value.dtype == like_full[name].dtype, name
@@ -294,7 +292,7 @@ def with_derivative(op: Any, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
     targets = [value for value in (result if isinstance(result, tuple) else (result,)) if value.requires_grad]
     leaves = [value for value in held if isinstance(value, Tensor) and value.requires_grad]
     if not targets:
-        return held
+        return arguments
     try:
         torch.autograd.grad([value.sum() for value in targets], leaves, allow_unused=True)
     except RuntimeError as error:
