@@ -132,7 +132,8 @@ def register(
     """Registers what a compiled op needs beside its kernel: shapes, derivative and autocast rule.
 
     An op without ``backward`` raises by name when it is differentiated, since torch would otherwise leave the
-    gradient out of a sum without a word. ``differentiable=False`` marks ops whose outputs carry no gradient at all.
+    gradient out of a sum without a word. ``differentiable=False`` marks ops whose outputs are constants, which carry no
+    gradient at all.
     Under ``torch.vmap`` every op raises by name, where torch would loop over the batch.
     """
     if not available():
@@ -152,18 +153,26 @@ def register(
 
     torch.library.register_vmap(name, refuse_vmap)
     if not differentiable:
-        return
-    if backward is None:
+        setup_context, backward = _mark_constants, _no_gradients
+    elif backward is None:
 
-        def refuse(ctx: Any, *grads: Tensor) -> None:
+        def backward(ctx: Any, *grads: Tensor) -> None:
             raise RuntimeError(f"{op}: a further derivative is not supported")
 
-        torch.library.register_autograd(name, refuse, setup_context=_save_nothing)
-    else:
-        torch.library.register_autograd(name, backward, setup_context=setup_context)
+        setup_context = _save_nothing
+    torch.library.register_autograd(name, backward, setup_context=setup_context)
     for device in ("cpu", "cuda"):  # half-precision regions compute these ops in float32
         torch.library.register_autocast(name, device, torch.float32)
 
 
 def _save_nothing(ctx: Any, inputs: Any, output: Any) -> None:
     pass
+
+
+def _mark_constants(ctx: Any, inputs: Any, output: Any) -> None:
+    ctx.num_inputs = len(inputs)
+    ctx.mark_non_differentiable(*(output if isinstance(output, tuple) else (output,)))
+
+
+def _no_gradients(ctx: Any, *grads: Tensor) -> tuple[None, ...]:
+    return (None,) * ctx.num_inputs

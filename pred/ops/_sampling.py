@@ -39,6 +39,8 @@ def arguments(op: str, name: str, axes: int, map_: Tensor, grid: Tensor, padding
     check_shape(op, name, map_, ("B", "C", "D", "H", "W") if axes == 3 else ("B", "C", "H", "W"))
     check_shape(op, "grid", grid, (map_.shape[0], "N", axes))
     check_dtype(op, name, map_, (*FLOATING, *HALF))
+    if map_.dtype in HALF:
+        check_dtype(op, "grid", grid, (torch.float32,))
     check_like(op, "grid", grid, name, map_.new_empty(0, dtype=torch.float32) if map_.dtype in HALF else map_)
     check_choice(op, "padding_mode", padding_mode, ("zeros", "border"))
     if 0 in map_.shape[2:]:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -187,14 +186,4 @@ def _fake(
     return edges.new_empty(edges.shape[0], u.shape[-1])
 
 
-def mark_constant(ctx: Any, inputs: Any, output: Any) -> None:
-    """Context of an op whose output carries no gradient."""
-    ctx.mark_non_differentiable(output)
-
-
-def no_gradients(ctx: Any, grad: Tensor) -> tuple[None, ...]:
-    """Of the three tensors and four options of sample_pdf and resample_rays."""
-    return (None,) * 7
-
-
-_native.register("sample_pdf", fake=_fake, setup_context=mark_constant, backward=no_gradients)
+_native.register("sample_pdf", fake=_fake, differentiable=False)
