@@ -191,6 +191,7 @@ def _composite_alpha_cases(sizes: Sizes) -> list[Case]:
             reference=plain,
             eager=variants,
             compiled=tuple(variants),
+            peers=peers.composite(),
             derivative_in=(0,),
             derivative_of=(1,),
             phases=(Phase(FORWARD, "4 (3 RS)", 3 * plane), Phase(BACKWARD, "4 (6 RS)", 6 * plane)),
@@ -205,6 +206,7 @@ def _composite_alpha_cases(sizes: Sizes) -> list[Case]:
             reference=plain,
             eager=variants,
             compiled=tuple(variants),
+            peers=peers.composite(),
             derivative_in=(0, 2),
             derivative_of=(1, 3),
             phases=(

@@ -143,7 +143,9 @@ def test_peers_of_compositing(monkeypatch: pytest.MonkeyPatch) -> None:
 
     module.render_weight_from_alpha, module.accumulate_along_rays = render_weight_from_alpha, accumulate_along_rays
     monkeypatch.setitem(sys.modules, "nerfacc", module)
-    for case in make_cases("composite_rays", TINY):
+    found = [case for op in ("composite_rays", "composite_alpha") for case in make_cases(op, TINY) if case.peers]
+    assert {case.op for case in found} == {"composite_rays", "composite_alpha"}
+    for case in found:
         (row,) = rows_of(case, ["peers"], phase=2)
         assert (row.contender, row.status) == ("nerfacc", "ok")
 
