@@ -152,6 +152,7 @@ def register(
 
     torch.library.register_vmap(name, refuse_vmap)
     if not differentiable:
+        torch.library.register_autograd(name, _no_gradients, setup_context=_mark_constant)
         return
     if backward is None:
 
@@ -163,6 +164,15 @@ def register(
         torch.library.register_autograd(name, backward, setup_context=setup_context)
     for device in ("cpu", "cuda"):  # half-precision regions compute these ops in float32
         torch.library.register_autocast(name, device, torch.float32)
+
+
+def _mark_constant(ctx: Any, inputs: Any, output: Any) -> None:
+    ctx.num_inputs = len(inputs)
+    ctx.mark_non_differentiable(*(output if isinstance(output, tuple) else (output,)))
+
+
+def _no_gradients(ctx: Any, *grads: Any) -> tuple[None, ...]:
+    return (None,) * ctx.num_inputs
 
 
 def _save_nothing(ctx: Any, inputs: Any, output: Any) -> None:
