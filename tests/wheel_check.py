@@ -22,7 +22,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "build/wheel-check"
-TESTS = ("conftest.py", "tolerances.py", "fuzz_ops.py", "ops")
+COPIED = (
+    "tests/conftest.py",
+    "tests/tolerances.py",
+    "tests/fuzz_ops.py",
+    "tests/ops",
+    "benchmarks",
+)  # inputs are shared
 FACTS = """
 import sys, torch
 from pred import _native
@@ -62,10 +68,13 @@ def check(wheel: Path, torch: str, python: str) -> str:
     run([*install, "--no-deps", "--force-reinstall", str(wheel)])
     with tempfile.TemporaryDirectory() as name:
         outside = Path(name)  # of the source tree, whose pred/ would be imported
-        for part in TESTS:
-            source, target = ROOT / "tests" / part, outside / "tests" / part
+        for part in COPIED:
+            source, target = ROOT / part, outside / part
             target.parent.mkdir(exist_ok=True)
-            shutil.copytree(source, target) if source.is_dir() else shutil.copy(source, target)
+            if source.is_dir():
+                shutil.copytree(source, target, ignore=shutil.ignore_patterns("results", "__pycache__"))
+            else:
+                shutil.copy(source, target)
         facts = subprocess.run([str(binary), "-c", FACTS], cwd=outside, capture_output=True, text=True, check=True)
         print(facts.stdout, end="", flush=True)
         run([str(binary), "-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", "pythonpath=.", "tests/ops"], outside)

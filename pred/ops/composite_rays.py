@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
+from pred.ops._check import check_tensors
 from pred.ops._composite import Composite, composite_arguments, composite_reference, layout
 from pred.ops.sdf_to_alpha import sdf_arguments, sdf_to_alpha_reference, valid_sharpness
 
@@ -136,6 +137,7 @@ def _arguments(
     detach_inv_s: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     op = "composite_rays"
+    check_tensors(op, t=t)
     sdf, ranges, values = composite_arguments(op, "sdf", sdf, t, values, ray_offsets, depth_at)
     assert ranges is not None
     _, inv_s = sdf_arguments(op, sdf if ray_offsets is None else sdf[None], inv_s, "pair", last)

@@ -227,7 +227,7 @@ def _sharpness(op: str, inv_s: Tensor | float, sdf: Tensor) -> Tensor:
     if not isinstance(inv_s, Tensor):
         if not 0 <= inv_s < math.inf:
             raise ValueError(f"{op}: inv_s must be finite and not negative, got {inv_s}")
-        return _scalar(inv_s, sdf)
+        return _scalar(float(inv_s), sdf)
     if inv_s.numel() != 1:
         raise ValueError(f"{op}: inv_s must have one element, got shape {list(inv_s.shape)}")
     if not inv_s.is_floating_point():
