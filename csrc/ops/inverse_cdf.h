@@ -39,18 +39,20 @@ struct Row {
 };
 
 template <typename T>
-static int64_t row_scratch_size(int64_t num_samples, int64_t num_new) {
-  return 5 * (padded(num_samples) + 2 * kPad) + 2 * (num_new + 2 * kPad);
-}
-
-static int64_t row_int_scratch_size(int64_t num_samples, int64_t num_new) {
-  return padded(num_samples - 1) + num_samples + num_new + kPad + (num_new > num_samples ? num_new - num_samples : 0);
+static int64_t scratch_size(const SamplePdfArgs<T>& a) {
+  return kPad + 5 * (padded(a.num_edges) + 2 * kPad) + 2 * (a.num_new + 2 * kPad);
 }
 
 template <typename T>
-static Row<T> make_row(int64_t num_samples, int64_t num_new, T* scratch, int32_t* int_scratch) {
-  const int64_t sections = num_samples - 1, size = padded(sections), stride = size + 2 * kPad;
-  T* first = scratch + kPad;
+static int64_t int_scratch_size(const SamplePdfArgs<T>& a) {
+  const int64_t more = a.num_new > a.num_edges ? a.num_new - a.num_edges : 0;
+  return padded(a.num_edges - 1) + a.num_edges + a.num_new + kPad + more;
+}
+
+template <typename T>
+static Row<T> make_row(const SamplePdfArgs<T>& a, T* scratch, int32_t* int_scratch) {
+  const int64_t sections = a.num_edges - 1, size = padded(sections), stride = size + 2 * kPad;
+  T* first = (T*)((uintptr_t(scratch) + 63) / 64 * 64) + kPad;  // rows are aligned to 64 bytes
   T* u = first + 4 * stride;
   first[3 * stride + size] = T(0);  // the slope behind the last section
   return {sections,
@@ -60,9 +62,9 @@ static Row<T> make_row(int64_t num_samples, int64_t num_new, T* scratch, int32_t
           first + 2 * stride,
           first + 3 * stride,
           u,
-          u + num_new + kPad,
+          u + a.num_new + kPad,
           int_scratch,
-          int_scratch + num_new};
+          int_scratch + a.num_new};
 }
 
 // To [0, 1); keeps NaN.

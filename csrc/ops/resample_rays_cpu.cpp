@@ -3,24 +3,15 @@
 //
 // One iteration owns one ray and writes that ray's row only.
 //
-// The row is assembled in scratch as whole vectors: section by section, each overwriting the surplus of the one before,
-// or vector by vector where lanes can be permuted. Rays whose t or u are out of order or not finite, and other rules
-// than the exact one, take the slow path: search, then merge or sort.
+// t_i comes after exactly the c_i samples with u_k < cdf_i, so that the exact rule needs no comparison of ranges to
+// merge: it emits t_0, c_1 samples, t_1, c_2 - c_1 samples, and so on. The row is assembled in scratch as whole
+// vectors: section by section, each overwriting the surplus of the one before, or vector by vector where lanes can be
+// permuted. Rays whose t or u are out of order or not finite, and other rules than the exact one, take the slow path:
+// search, then merge or sort.
 #include "ops/inverse_cdf.h"
-#include "ops/resample_rays.h"
 
 namespace pred::PRED_ISA {
 namespace {
-
-template <typename T>
-static int64_t scratch_size(const ResampleRaysArgs<T>& a) {
-  return row_scratch_size<T>(a.num_samples, a.num_new);
-}
-
-template <typename T>
-static int64_t int_scratch_size(const ResampleRaysArgs<T>& a) {
-  return row_int_scratch_size(a.num_samples, a.num_new);
-}
 
 // How a row of u lies.
 enum class Spread {
@@ -190,21 +181,21 @@ static inline void prefetch(const T* row, int64_t n) {
 }
 
 template <typename T>
-static void resample_exact(const ResampleRaysArgs<T>& a, T* merged, T* scratch, int32_t* int_scratch, int64_t begin,
+static void resample_exact(const SamplePdfArgs<T>& a, T* merged, T* scratch, int32_t* int_scratch, int64_t begin,
                            int64_t end) {
-  const Row<T> row = make_row(a.num_samples, a.num_new, scratch, int_scratch);
+  const Row<T> row = make_row(a, scratch, int_scratch);
   // Whether a section starts at each place of the merged row; lies over what the search would need.
   int32_t* starts_at = row.low + row.size;
-  const int64_t out_size = a.num_samples + a.num_new;
+  const int64_t out_size = a.num_edges + a.num_new;
   Positions<T> positions{};
   for (int64_t ray = begin; ray < end; ++ray) {
     if (a.u_stride != 0 || ray == begin) positions = read_positions(a.u + ray * a.u_stride, a.num_new, row.u);
     if (ray + 1 < end) {
-      prefetch(a.t + (ray + 1) * a.num_samples, a.num_samples);
+      prefetch(a.edges + (ray + 1) * a.num_edges, a.num_edges);
       prefetch(a.weights + (ray + 1) * a.weight_stride, a.weight_stride);
       prefetch(a.u + (ray + 1) * a.u_stride, a.u_stride);
     }
-    read_ranges(a.t + ray * a.num_samples, row);
+    read_ranges(a.edges + ray * a.num_edges, row);
     const bool has_cdf = distribution(a.weights + ray * a.weight_stride, row);
     const bool in_order = ascending(row.t, row.size + 1) && row.t[0] >= -Limits<T>::largest &&
                           row.t[row.size] <= Limits<T>::largest && positions.spread != Spread::kOther;
@@ -220,28 +211,28 @@ static void resample_exact(const ResampleRaysArgs<T>& a, T* merged, T* scratch, 
       const T* __restrict from = row.out;
       for (int64_t i = 0; i < out_size; ++i) out[i] = from[i];
     } else {
-      exact_samples(has_cdf, a.num_new, row, row.out + a.num_samples);
-      merge_any(row.t, a.num_samples, a.num_new, row.out, out);
+      exact_samples(has_cdf, a.num_new, row, row.out + a.num_edges);
+      merge_any(row.t, a.num_edges, a.num_new, row.out, out);
     }
   }
 }
 
 template <typename T>
-static void resample_published(const ResampleRaysArgs<T>& a, T* merged, T* scratch, int32_t* int_scratch, int64_t begin,
+static void resample_published(const SamplePdfArgs<T>& a, T* merged, T* scratch, int32_t* int_scratch, int64_t begin,
                                int64_t end) {
-  const Row<T> row = make_row(a.num_samples, a.num_new, scratch, int_scratch);
+  const Row<T> row = make_row(a, scratch, int_scratch);
   for (int64_t ray = begin; ray < end; ++ray) {
     const T* u = a.u + ray * a.u_stride;
     for (int64_t k = 0; k < a.num_new; ++k) row.u[k] = u[k];
-    read_ranges(a.t + ray * a.num_samples, row);
+    read_ranges(a.edges + ray * a.num_edges, row);
     published_distribution(a.rule, a.weights + ray * a.weight_stride, row);
-    published_samples(a.rule, a.num_new, row, row.out + a.num_samples);
-    merge_any(row.t, a.num_samples, a.num_new, row.out, merged + ray * (a.num_samples + a.num_new));
+    published_samples(a.rule, a.num_new, row, row.out + a.num_edges);
+    merge_any(row.t, a.num_edges, a.num_new, row.out, merged + ray * (a.num_edges + a.num_new));
   }
 }
 
 template <typename T>
-static void resample(const ResampleRaysArgs<T>& a, T* merged, T* scratch, int32_t* int_scratch, int64_t begin,
+static void resample(const SamplePdfArgs<T>& a, T* merged, T* scratch, int32_t* int_scratch, int64_t begin,
                      int64_t end) {
   const auto run = a.rule.mode == PdfMode::kExact ? resample_exact<T> : resample_published<T>;
   run(a, merged, scratch, int_scratch, begin, end);
@@ -249,8 +240,7 @@ static void resample(const ResampleRaysArgs<T>& a, T* merged, T* scratch, int32_
 
 }  // namespace
 
-const ResampleRaysKernels<float> resample_rays_f32 = {scratch_size<float>, int_scratch_size<float>, resample<float>};
-const ResampleRaysKernels<double> resample_rays_f64 = {scratch_size<double>, int_scratch_size<double>,
-                                                       resample<double>};
+const SamplePdfKernels<float> resample_rays_f32 = {scratch_size<float>, int_scratch_size<float>, resample<float>};
+const SamplePdfKernels<double> resample_rays_f64 = {scratch_size<double>, int_scratch_size<double>, resample<double>};
 
 }  // namespace pred::PRED_ISA

@@ -1,7 +1,8 @@
 // Copyright 2026 The PRED authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// sample_pdf: inverse-CDF samples of a ray's sections, by one of three rules.
+// sample_pdf: inverse-CDF samples of a ray's sections, by one of three rules. resample_rays: such samples, merged with
+// the ray's own, which are the edges.
 //
 // Sample k lies in the section i with cdf_i <= u_k < cdf_{i+1}, at
 //   e_i + (u_k - cdf_i) / (cdf_{i+1} - cdf_i) (e_{i+1} - e_i).
@@ -40,11 +41,13 @@ template <typename T>
 struct SamplePdfKernels {
   int64_t (*scratch_size)(const SamplePdfArgs<T>&);      // in elements, for one range
   int64_t (*int_scratch_size)(const SamplePdfArgs<T>&);  // likewise
-  // samples [R, num_new]
-  void (*sample)(const SamplePdfArgs<T>&, T* samples, T* scratch, int32_t* int_scratch, int64_t begin, int64_t end);
+  // out: [R, num_new], or merged [R, S + num_new]
+  void (*sample)(const SamplePdfArgs<T>&, T* out, T* scratch, int32_t* int_scratch, int64_t begin, int64_t end);
 };
 
 }  // namespace pred
 
 PRED_DECLARE_KERNELS(SamplePdfKernels<float>, sample_pdf_f32)
 PRED_DECLARE_KERNELS(SamplePdfKernels<double>, sample_pdf_f64)
+PRED_DECLARE_KERNELS(SamplePdfKernels<float>, resample_rays_f32)
+PRED_DECLARE_KERNELS(SamplePdfKernels<double>, resample_rays_f64)

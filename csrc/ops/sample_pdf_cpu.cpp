@@ -3,25 +3,14 @@
 //
 // One iteration owns one ray and writes that ray's row only.
 #include "ops/inverse_cdf.h"
-#include "ops/sample_pdf.h"
 
 namespace pred::PRED_ISA {
 namespace {
 
 template <typename T>
-static int64_t scratch_size(const SamplePdfArgs<T>& a) {
-  return row_scratch_size<T>(a.num_edges, a.num_new);
-}
-
-template <typename T>
-static int64_t int_scratch_size(const SamplePdfArgs<T>& a) {
-  return row_int_scratch_size(a.num_edges, a.num_new);
-}
-
-template <typename T>
 static void sample(const SamplePdfArgs<T>& a, T* samples, T* scratch, int32_t* int_scratch, int64_t begin,
                    int64_t end) {
-  const Row<T> row = make_row(a.num_edges, a.num_new, scratch, int_scratch);
+  const Row<T> row = make_row(a, scratch, int_scratch);
   const bool exact = a.rule.mode == PdfMode::kExact;
   for (int64_t ray = begin; ray < end; ++ray) {
     if (a.u_stride != 0 || ray == begin) {
