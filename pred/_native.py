@@ -121,6 +121,17 @@ def use_native(op: str, tensor: Tensor) -> bool:
     return _no_kernel(op, tensor.device.type, backend == "native")
 
 
+def checked(op: Callable[..., Any], *arguments: Any) -> Any:
+    """Calls a compiled op that checks values. Its ValueError passes through torch 2.13 unchanged, and arrives from
+    torch 2.15 as a RuntimeError of the same text."""
+    try:
+        return op(*arguments)
+    except RuntimeError as error:
+        if " must " in str(error).partition(": ")[2]:
+            raise ValueError(str(error)) from None
+        raise
+
+
 def register(
     op: str,
     *,

@@ -15,6 +15,7 @@ import torch
 
 from pred import _native
 from pred.ops import sample_bev
+from tests.conftest import KERNEL_ERROR
 
 
 def test_two_threads_really_run(native: None) -> None:
@@ -31,15 +32,15 @@ def test_two_threads_really_run(native: None) -> None:
 def test_text_of_a_workers_exception_is_kept(native: None, threads: int) -> None:
     torch.set_num_threads(threads)
     out = torch.zeros(64, dtype=torch.int64)
-    with pytest.raises(ValueError, match="parallel_probe: index 63 was asked to fail"):
+    with pytest.raises(KERNEL_ERROR, match="parallel_probe: index 63 was asked to fail"):
         torch.ops.pred.parallel_probe(out, 1, 63)
 
 
 def test_direct_calls_are_checked(native: None) -> None:
     bev, grid = torch.zeros(1, 2, 3, 4), torch.zeros(1, 5, 2)
-    with pytest.raises(ValueError, match=r"sample_bev: grid must have shape \[1, N, 2\], got \[2, 5, 2\]"):
+    with pytest.raises(KERNEL_ERROR, match=r"sample_bev: grid must have shape \[1, N, 2\], got \[2, 5, 2\]"):
         torch.ops.pred.sample_bev(bev, grid.expand(2, -1, -1), False, False)
-    with pytest.raises(ValueError, match="sample_bev: dtype must be float32, float64, bfloat16 or float16"):
+    with pytest.raises(KERNEL_ERROR, match="sample_bev: dtype must be float32, float64, bfloat16 or float16"):
         torch.ops.pred.sample_bev(bev.int(), grid, False, False)
 
 
@@ -56,7 +57,7 @@ def test_unknown_backend(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_unknown_instruction_set(native: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PRED_CPU_CAPABILITY", "sse9")
-    with pytest.raises(ValueError, match="PRED_CPU_CAPABILITY must be one of default, avx2, .*, got sse9"):
+    with pytest.raises(KERNEL_ERROR, match="PRED_CPU_CAPABILITY must be one of default, avx2, .*, got sse9"):
         sample_bev(torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 2))
 
 

@@ -81,8 +81,8 @@ def composite_rays(
             normalize_eps=normalize_eps,
         )
     sdf, inv_s, t, values = _arguments(sdf, inv_s, t, values, ray_offsets, depth_at, last, detach_sdf, detach_inv_s)
-    weights, depth, opacity, rendered, _ = torch.ops.pred.composite_rays(
-        sdf, inv_s, t, values, ray_offsets, depth_at == "mid", last == "opaque"
+    weights, depth, opacity, rendered, _ = _native.checked(
+        torch.ops.pred.composite_rays, sdf, inv_s, t, values, ray_offsets, depth_at == "mid", last == "opaque"
     )
     if normalize_depth:
         depth = depth / (opacity + normalize_eps)

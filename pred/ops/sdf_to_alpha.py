@@ -100,10 +100,12 @@ def sdf_to_alpha(
         out = torch.ops.pred.sdf_to_alpha_density(*_elementwise("density", sdf, section_length=section_length))
     elif mode == "section":
         inv_s, (sdf, cosine, length) = _section(sdf, inv_s, cosine, section_length)
-        out = torch.ops.pred.sdf_to_alpha_section(sdf, inv_s, cosine, length, _scalar(cos_anneal, sdf), eps)
+        out = _native.checked(
+            torch.ops.pred.sdf_to_alpha_section, sdf, inv_s, cosine, length, _scalar(cos_anneal, sdf), eps
+        )
     else:
         sdf, inv_s = sdf_arguments("sdf_to_alpha", sdf, inv_s, mode, last, ray_offsets)
-        out = torch.ops.pred.sdf_to_alpha(sdf, inv_s, last == "opaque", ray_offsets)
+        out = _native.checked(torch.ops.pred.sdf_to_alpha, sdf, inv_s, last == "opaque", ray_offsets)
     return out
 
 
@@ -130,7 +132,9 @@ def sdf_to_alpha_reference(
         fall = torch.relu(0.5 - 0.5 * cosine) * (1 - cos_anneal) + torch.relu(-cosine) * cos_anneal
         half = fall * length * 0.5
         if eps == 0:
-            return _closed_form(inv_s, sdf - half, (fall * length).clamp(min=0))
+            drop = fall * length
+            drop = torch.where(drop < 0, torch.zeros_like(drop), drop)  # clamp() has a derivative of 1 or 0 at 0
+            return _closed_form(inv_s, sdf - half, drop)
         start, end = torch.sigmoid(inv_s * (sdf + half)), torch.sigmoid(inv_s * (sdf - half))
         return ((start - end + eps) / (start + eps)).clip(0, 1)
     sdf, inv_s = sdf_arguments("sdf_to_alpha", sdf, inv_s, mode, last, ray_offsets)

@@ -41,7 +41,7 @@ def segment_reduce(
     if not _native.use_native("segment_reduce", features):
         return segment_reduce_reference(features, index, num_segments, reduce)
     features = _arguments(features, index, num_segments, reduce)
-    out: Tensor = torch.ops.pred.segment_reduce(features, index, num_segments, reduce)[0]
+    out: Tensor = _native.checked(torch.ops.pred.segment_reduce, features, index, num_segments, reduce)[0]
     return out
 
 

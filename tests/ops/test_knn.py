@@ -10,6 +10,7 @@ from torch import Tensor
 from torch._dynamo.testing import CompileCounterWithBackend
 
 from pred.ops import Neighbors, knn, reference
+from tests.conftest import KERNEL_ERROR
 from tests.ops.clouds import KINDS, cloud, offsets
 
 
@@ -175,11 +176,11 @@ def test_errors(backend: str) -> None:
 
 def test_direct_calls_are_checked(native: None) -> None:
     points, batch, call = cloud("normal", 10), torch.tensor([0, 10]), torch.ops.pred.knn
-    with pytest.raises(ValueError, match="knn: batch_offsets must ascend from 0 to N=10"):
+    with pytest.raises(KERNEL_ERROR, match="knn: batch_offsets must ascend from 0 to N=10"):
         call(points, torch.tensor([0, 12]), points, batch, 3)
-    with pytest.raises(ValueError, match="knn: query_offsets must ascend from 0 to M=10"):
+    with pytest.raises(KERNEL_ERROR, match="knn: query_offsets must ascend from 0 to M=10"):
         call(points, batch, points, torch.tensor([0, 9]), 3)
-    with pytest.raises(ValueError, match="knn: size 0 of query_offsets must be 2"):
+    with pytest.raises(KERNEL_ERROR, match="knn: size 0 of query_offsets must be 2"):
         call(points, batch, points, torch.tensor([0, 5, 10]), 3)
-    with pytest.raises(ValueError, match="knn: k must not be negative, got -1"):
+    with pytest.raises(KERNEL_ERROR, match="knn: k must not be negative, got -1"):
         call(points, batch, points, batch, -1)

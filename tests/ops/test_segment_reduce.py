@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pred.ops import reference, segment_reduce
+from tests.conftest import KERNEL_ERROR
 from tests.tolerances import FORWARD, GRADIENT, assert_close
 
 REDUCTIONS = ("sum", "mean", "max")
@@ -232,13 +233,13 @@ def test_errors(backend: str) -> None:
 def test_direct_calls_are_checked(native: None) -> None:
     features, index = case()
     backward = torch.ops.pred.segment_reduce_backward
-    with pytest.raises(ValueError, match=r"segment_reduce: index must have shape \[40\], got \[3\]"):
+    with pytest.raises(KERNEL_ERROR, match=r"segment_reduce: index must have shape \[40\], got \[3\]"):
         torch.ops.pred.segment_reduce(features, index[:3], 12, "sum")
-    with pytest.raises(ValueError, match="segment_reduce: dtype must be float32, float64, bfloat16 or float16"):
+    with pytest.raises(KERNEL_ERROR, match="segment_reduce: dtype must be float32, float64, bfloat16 or float16"):
         torch.ops.pred.segment_reduce(features.long(), index, 12, "sum")
-    with pytest.raises(ValueError, match=r"index must lie in \[-1, num_segments=11\)"):
+    with pytest.raises(KERNEL_ERROR, match=r"index must lie in \[-1, num_segments=11\)"):
         backward(features[:11], torch.full((4,), 11), torch.empty(0, dtype=torch.int32), "sum")
-    with pytest.raises(ValueError, match=r"saved must belong to grad of shape \[12, 5\], got \[12, 4\]"):
+    with pytest.raises(KERNEL_ERROR, match=r"saved must belong to grad of shape \[12, 5\], got \[12, 4\]"):
         backward(features[:12], index, torch.zeros(12, 4, dtype=torch.int32), "max")
 
 

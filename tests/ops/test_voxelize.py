@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pred.ops import Voxels, reference, segment_reduce, voxelize
+from tests.conftest import KERNEL_ERROR
 
 RANGE = (-51.2, -51.2, -5.0, 51.2, 51.2, 3.0)
 SIZES = [(0.1, 0.1, 0.2), (0.2, 0.2, 8.0), (0.075, 0.15, 0.4)]
@@ -252,11 +253,11 @@ def test_direct_calls_are_checked(native: None) -> None:
     points, size, point_range = cloud(10), list(SIZES[1]), list(RANGE)
     call = torch.ops.pred.voxelize
     for wrong in ([], [0], [1, 10], [0, 11], [0, 20, 10]):
-        with pytest.raises(ValueError, match="voxelize: batch_offsets must ascend from 0 to N=10"):
+        with pytest.raises(KERNEL_ERROR, match="voxelize: batch_offsets must ascend from 0 to N=10"):
             call(points, torch.tensor(wrong, dtype=torch.int64), size, point_range, [512, 512, 1])
-    with pytest.raises(ValueError, match=r"voxelize: grid_size must lie in \[1, 2\^30\], got 0"):
+    with pytest.raises(KERNEL_ERROR, match=r"voxelize: grid_size must lie in \[1, 2\^30\], got 0"):
         call(points, torch.tensor([0, 10]), size, point_range, [512, 0, 1])
-    with pytest.raises(ValueError, match="must hold 3, 6 and 3 numbers, got 3, 6 and 2"):
+    with pytest.raises(KERNEL_ERROR, match="must hold 3, 6 and 3 numbers, got 3, 6 and 2"):
         call(points, torch.tensor([0, 10]), size, point_range, [512, 512])
-    with pytest.raises(ValueError, match=r"at most 2\^62 voxels"):
+    with pytest.raises(KERNEL_ERROR, match=r"at most 2\^62 voxels"):
         call(points, torch.tensor([0, 10]), size, point_range, [2**30, 2**30, 8])

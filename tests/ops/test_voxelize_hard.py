@@ -12,6 +12,7 @@ from torch._dynamo.testing import CompileCounterWithBackend
 
 from benchmarks.cases import POINT_RANGE_M, lidar_points
 from pred.ops import HardVoxels, reference, voxelize_hard
+from tests.conftest import KERNEL_ERROR
 from tests.tolerances import assert_close
 
 RANGE = (-51.2, -51.2, -5.0, 51.2, 51.2, 3.0)
@@ -286,9 +287,9 @@ def test_direct_calls_are_checked(native: None) -> None:
     points, size, bounds = cloud(10), list(SIZES[1]), list(RANGE)
     forward, backward = torch.ops.pred.voxelize_hard, torch.ops.pred.voxelize_hard_backward
     for wrong in ([], [0], [1, 10], [0, 20, 10]):
-        with pytest.raises(ValueError, match="voxelize_hard: batch_offsets must ascend from 0 to N=10"):
+        with pytest.raises(KERNEL_ERROR, match="voxelize_hard: batch_offsets must ascend from 0 to N=10"):
             forward(points, torch.tensor(wrong, dtype=torch.int64), size, bounds, [512, 512, 1], 1, 1)
-    with pytest.raises(ValueError, match="voxelize_hard: max_points must be at least 1, got 0"):
+    with pytest.raises(KERNEL_ERROR, match="voxelize_hard: max_points must be at least 1, got 0"):
         forward(points, torch.tensor([0, 10]), size, bounds, [512, 512, 1], 0, 1)
-    with pytest.raises(ValueError, match="voxelize_hard_backward: point_to_slot must be less than 6, got 6"):
+    with pytest.raises(KERNEL_ERROR, match="voxelize_hard_backward: point_to_slot must be less than 6, got 6"):
         backward(torch.zeros(2, 3, 5), torch.tensor([0, -1, 6]))
