@@ -18,7 +18,7 @@ from torch._dynamo.testing import CompileCounterWithBackend
 
 from pred import ops
 from pred.ops import reference, sample_bev, sample_bev_with_grad, sample_volume, sample_volume_with_grad
-from tests.conftest import KERNEL_ERROR
+from tests.conftest import KERNEL_ERROR, SANITIZED
 from tests.tolerances import FORWARD, GRADIENT, assert_close
 
 MODES = [(padding, align) for padding in ("zeros", "border") for align in (False, True)]
@@ -461,6 +461,7 @@ def test_rounding_to_half_is_to_nearest_even(level: str, dtype: torch.dtype) -> 
 
 
 @pytest.mark.large
+@pytest.mark.skipif(SANITIZED, reason="the sanitizer keeps notes on every page")
 def test_more_than_2_to_the_31_elements(native: None) -> None:
     """Pages of the map that nobody writes cost no memory, and one channel is channels-last: nothing is copied."""
     peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
