@@ -146,7 +146,7 @@ struct Sections {
     args = {sdf.const_data_ptr<T>(),
             cosine.const_data_ptr<T>(),
             length.const_data_ptr<T>(),
-            read_sharpness<T>(op, inv_s, sdf.scalar_type()),
+            read_sharpness<T>("sdf_to_alpha", inv_s, sdf.scalar_type()),  // as the public op calls itself
             {*cos_anneal.const_data_ptr<T>(), T(eps)}};
   }
 };

@@ -113,7 +113,7 @@ def _arguments(
     transmittance_eps: float,
     depth_at: str,
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    if not math.isfinite(transmittance_eps):
+    if not -math.inf < transmittance_eps < math.inf:
         raise ValueError(f"composite_alpha: transmittance_eps must be finite, got {transmittance_eps}")
     return composite_arguments("composite_alpha", "alpha", alpha, t, values, ray_offsets, depth_at)
 

@@ -647,7 +647,7 @@ def test_autocast(backend: str) -> None:
 def test_errors(backend: str) -> None:
     sdf = rays(2, 4)
 
-    def section(sdf: Tensor = sdf, inv_s: float | None = 2.7, **options: object) -> Tensor:
+    def section(sdf: Tensor = sdf, inv_s: Tensor | float | None = 2.7, **options: object) -> Tensor:
         given = {"cosine": sdf, "section_length": sdf, **options}
         return sdf_to_alpha(sdf, inv_s, mode="section", **given)  # type: ignore[arg-type]
 
@@ -681,6 +681,8 @@ def test_errors(backend: str) -> None:
         section(eps=-1e-5)
     with pytest.raises(ValueError, match="sdf_to_alpha: inv_s must be finite and not negative, got nan"):
         section(inv_s=torch.nan)
+    with pytest.raises(ValueError, match="sdf_to_alpha: inv_s must be finite and not negative, got nan"):
+        section(inv_s=torch.tensor(torch.nan, dtype=sdf.dtype))
     with pytest.raises(ValueError, match="sdf_to_alpha: ray_offsets must be None in mode 'section', got a value"):
         section(ray_offsets=torch.tensor([0, 2]))
     flat = sdf.flatten()
