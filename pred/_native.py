@@ -105,14 +105,28 @@ def _no_kernel(op: str, device: str, required: bool) -> bool:
     return False
 
 
+def _refuse_transforms(op: str) -> None:
+    """Transforms that would leave a derivative out without a word, or loop over a batch."""
+    interpreter = torch._C._functorch.peek_interpreter_stack()
+    if interpreter is not None:
+        if interpreter.key() == torch._C._functorch.TransformType.Vmap:
+            raise RuntimeError(f"{op}: torch.vmap is not supported; call it once on the whole batch")
+        raise RuntimeError(f"{op}: transforms of torch.func are not supported; use torch.autograd.grad")
+    if torch.autograd.forward_ad._current_level >= 0:
+        raise RuntimeError(f"{op}: forward-mode derivatives are not supported; use torch.autograd.grad")
+
+
 def use_native(op: str, tensor: Tensor) -> bool:
     """Whether ``op`` runs compiled for tensors like this one. What is no tensor goes to the reference, whose checks
     name it.
 
     Raises:
         ValueError: ``PRED_BACKEND`` has an unknown value.
-        RuntimeError: it is ``native`` and the library or a kernel for the tensor's device is missing.
+        RuntimeError: it is ``native`` and the library or a kernel for the tensor's device is missing; the call is under
+            ``torch.vmap``, another transform of ``torch.func``, or forward-mode differentiation.
     """
+    if not torch.compiler.is_compiling():
+        _refuse_transforms(op)
     backend = _backend()
     if backend == "reference" or not isinstance(tensor, Tensor):
         return False

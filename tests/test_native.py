@@ -8,10 +8,13 @@ import os
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
+from torch.autograd import forward_ad
 
 from pred import _native
 from pred.ops import sample_bev
@@ -44,9 +47,28 @@ def test_direct_calls_are_checked(native: None) -> None:
         torch.ops.pred.sample_bev(bev.int(), grid, False, False)
 
 
-def test_vmap_is_refused_by_name(native: None) -> None:
-    with pytest.raises(RuntimeError, match="sample_bev: torch.vmap is not supported; call it once on the whole batch"):
-        torch.vmap(lambda bev, grid: sample_bev(bev, grid))(torch.zeros(2, 1, 3, 4, 5), torch.zeros(2, 1, 6, 2))
+@pytest.mark.parametrize(
+    "transform", [torch.func.grad, lambda f: lambda x: torch.func.jvp(f, (x,), (torch.ones_like(x),))]
+)
+def test_transforms_are_refused_by_name(backend: str, transform: Callable[..., Callable[[Tensor], object]]) -> None:
+    """A compiled op would give a derivative of 0 in forward mode."""
+    grid = torch.zeros(1, 6, 2)
+    with pytest.raises(RuntimeError, match="sample_bev: transforms of torch.func are not supported"):
+        transform(lambda bev: sample_bev(bev, grid).sum())(torch.ones(1, 3, 4, 5))
+
+
+def test_forward_mode_is_refused_by_name(backend: str) -> None:
+    bev, grid = torch.ones(1, 3, 4, 5), torch.zeros(1, 6, 2)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(bev, bev)
+        with pytest.raises(RuntimeError, match="sample_bev: forward-mode derivatives are not supported"):
+            sample_bev(dual, grid)
+
+
+def test_direct_calls_with_empty_maps_are_refused(native: None) -> None:
+    for shape in [(1, 7, 0, 4), (1, 7, 4, 0)]:
+        with pytest.raises(KERNEL_ERROR, match="sample_bev: bev must have at least one cell along each axis"):
+            torch.ops.pred.sample_bev(torch.empty(shape), torch.zeros(1, 1, 2), False, False)
 
 
 def test_unknown_backend(monkeypatch: pytest.MonkeyPatch) -> None:

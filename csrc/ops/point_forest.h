@@ -135,8 +135,10 @@ class PointForest {
     }
     const int64_t count = begin_.back(), num_groups = int64_t(groups.size());
     const int row_bits = bits_for(count), group_bits = bits_for(num_groups);
-    const auto sorted = sort_rows<uint64_t>(
-        count, row_bits, group_bits + 3 * kCellBits, [&](uint64_t* items, int64_t begin, int64_t end) {
+    // So many points in so many groups leave fewer bits for cells: then these are larger.
+    const int curve_bits = std::min(3 * kCellBits, (64 - row_bits - group_bits) / 3 * 3);
+    const auto sorted =
+        sort_rows<uint64_t>(count, row_bits, group_bits + curve_bits, [&](uint64_t* items, int64_t begin, int64_t end) {
           for_each_frame(group_offset.data(), num_groups, begin, end, [&](int64_t g, int64_t first, int64_t last) {
             const Group& group = groups[g];
             for (int64_t i = first; i < last; ++i) {
@@ -144,7 +146,7 @@ class PointForest {
               for (int axis = 0; axis < 3 && group.cells_per_unit > 0; ++axis) {
                 curve |= spread(cell(points_[i].position[axis], group.low[axis], group.cells_per_unit)) << axis;
               }
-              *items++ = (uint64_t(g) << 3 * kCellBits | curve) << row_bits | uint64_t(i);
+              *items++ = (uint64_t(g) << curve_bits | curve >> (3 * kCellBits - curve_bits)) << row_bits | uint64_t(i);
             }
           });
           return end - begin;

@@ -58,11 +58,13 @@ struct SampleGrid {
       args.stride[0] = args.channels;
       for (int axis = 0; axis < kAxes; ++axis) {
         args.size[axis] = map.size(1 + kAxes - axis);
+        PRED_CHECK(args.size[axis] >= 1, op, ": ", Op::kMap, " must have at least one cell along each axis, got ",
+                   shape_text(map_in));
         args.stride[axis + 1] = args.stride[axis] * args.size[axis];
       }
       args.border = border;
       args.align_corners = align_corners;
-      zeros.reset(new S[map.numel() > 0 ? args.channels : 0]());
+      zeros.reset(new S[num_samples() > 0 ? args.channels : 0]());
       args.zeros = zeros.get();
     }
 

@@ -125,7 +125,7 @@ def test_one_graph_and_two_compilations(backend: str, example: Example, request:
 
 
 @every_example
-def test_vmap_is_refused_by_name(native: None, example: Example) -> None:
+def test_vmap_is_refused_by_name(backend: str, example: Example) -> None:
     arguments = example.example(6)
     tensors = {k: v for k, v in arguments.items() if isinstance(v, Tensor) and v.is_floating_point()}
     rest = {name: value for name, value in arguments.items() if name not in tensors}
