@@ -105,8 +105,15 @@ def _no_kernel(op: str, device: str, required: bool) -> bool:
     return False
 
 
-def _refuse_transforms(op: str) -> None:
-    """Transforms that would leave a derivative out without a word, or loop over a batch."""
+def refuse_transforms(op: str) -> None:
+    """First line of every public op.
+
+    Raises:
+        RuntimeError: the call is under ``torch.vmap``, another transform of ``torch.func``, or forward-mode
+            differentiation, which would leave a derivative out without a word, or loop over a batch.
+    """
+    if torch.compiler.is_compiling():
+        return
     interpreter = torch._C._functorch.peek_interpreter_stack()
     if interpreter is not None:
         if interpreter.key() == torch._C._functorch.TransformType.Vmap:
@@ -122,11 +129,8 @@ def use_native(op: str, tensor: Tensor) -> bool:
 
     Raises:
         ValueError: ``PRED_BACKEND`` has an unknown value.
-        RuntimeError: it is ``native`` and the library or a kernel for the tensor's device is missing; the call is under
-            ``torch.vmap``, another transform of ``torch.func``, or forward-mode differentiation.
+        RuntimeError: it is ``native`` and the library or a kernel for the tensor's device is missing.
     """
-    if not torch.compiler.is_compiling():
-        _refuse_transforms(op)
     backend = _backend()
     if backend == "reference" or not isinstance(tensor, Tensor):
         return False

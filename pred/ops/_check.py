@@ -62,6 +62,31 @@ def check_features(op: str, name: str, features: Tensor, other_name: str, geomet
     check_like(op, name, features.new_empty(0, dtype=torch.float32) if half else features, other_name, geometry)
 
 
+def check_number(op: str, name: str, value: object) -> None:
+    """``value`` must be a plain number. In a compiled graph it may be symbolic, and is not looked at."""
+    if torch.compiler.is_compiling():
+        return
+    if isinstance(value, Tensor) or not hasattr(value, "__float__"):
+        raise TypeError(f"{op}: {name} must be a number, got {type(value).__name__}")
+
+
+def check_count(op: str, name: str, value: int, least: int = 0) -> None:
+    """``value`` must be an integer of at least ``least``. In a compiled graph it is not looked at, as above."""
+    if torch.compiler.is_compiling():
+        return
+    if isinstance(value, (bool, Tensor)) or not hasattr(value, "__index__"):
+        raise TypeError(f"{op}: {name} must be an integer, got {type(value).__name__}")
+    if value < least:
+        raise ValueError(f"{op}: {name} must be at least {least}, got {value}")
+
+
+def check_flags(op: str, **flags: object) -> None:
+    """Each must be True or False."""
+    for name, value in flags.items():
+        if not isinstance(value, bool):
+            raise TypeError(f"{op}: {name} must be True or False, got {type(value).__name__}")
+
+
 def check_choice(op: str, name: str, value: str, choices: Sequence[str]) -> None:
     """``value`` must be one of ``choices``."""
     if value not in choices:

@@ -15,7 +15,9 @@ from pred.ops._check import (
     check_choice,
     check_dtype,
     check_features,
+    check_flags,
     check_like,
+    check_number,
     check_offsets,
     check_shape,
     check_tensors,
@@ -40,6 +42,13 @@ def geometry(tensor: Tensor, packed: bool) -> Tensor:
     return as_geometry(tensor)
 
 
+def check_options(op: str, depth_at: str, normalize_depth: bool, normalize_eps: float) -> None:
+    """What both composites are told about the depth."""
+    check_choice(op, "depth_at", depth_at, ("start", "mid"))
+    check_flags(op, normalize_depth=normalize_depth)
+    check_number(op, "normalize_eps", normalize_eps)
+
+
 def composite_arguments(
     op: str,
     name: str,
@@ -47,10 +56,8 @@ def composite_arguments(
     t: Tensor | None,
     values: Tensor | None,
     ray_offsets: Tensor | None,
-    depth_at: str,
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
     """Checked ``source`` (called ``name``), ``t`` and ``values``, with shapes and dtypes as the kernels take them."""
-    check_choice(op, "depth_at", depth_at, ("start", "mid"))
     packed = ray_offsets is not None
     optional = {"t": t, "values": values, "ray_offsets": ray_offsets}
     check_tensors(op, **{name: source}, **{key: value for key, value in optional.items() if value is not None})

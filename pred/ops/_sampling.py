@@ -18,6 +18,7 @@ from pred.ops._check import (
     as_geometry,
     check_choice,
     check_dtype,
+    check_flags,
     check_like,
     check_shape,
     check_tensors,
@@ -32,7 +33,9 @@ class SampledWithGrad(NamedTuple):
     grads: Tensor  # [B, N, A, C], d values / d grid[..., a]; A = 2 (x, y) or 3 (x, y, z)
 
 
-def arguments(op: str, name: str, axes: int, map_: Tensor, grid: Tensor, padding_mode: str) -> tuple[Tensor, Tensor]:
+def arguments(
+    op: str, name: str, axes: int, map_: Tensor, grid: Tensor, padding_mode: str, align_corners: bool
+) -> tuple[Tensor, Tensor]:
     """Checked map, here named as the caller knows it, and grid; a half-precision grid is widened to float32."""
     check_tensors(op, **{name: map_, "grid": grid})
     map_, grid = widen(map_), as_geometry(grid)
@@ -42,6 +45,7 @@ def arguments(op: str, name: str, axes: int, map_: Tensor, grid: Tensor, padding
     if map_.dtype in HALF:
         check_dtype(op, "grid", grid, (torch.float32,))
     check_like(op, "grid", grid, name, map_.new_empty(0, dtype=torch.float32) if map_.dtype in HALF else map_)
+    check_flags(op, align_corners=align_corners)
     check_choice(op, "padding_mode", padding_mode, ("zeros", "border"))
     if 0 in map_.shape[2:]:
         what = "layer, row and column" if axes == 3 else "row and column"

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
+from pred.ops._check import check_count, check_number
 from pred.ops._clouds import check_queries, frame_slices, squared_distances
 
 _CHUNK = 2**22
@@ -59,6 +60,7 @@ def ball_query(
 
     Not differentiable: the outputs are integers. Equal bits for any thread count and instruction set.
     """
+    _native.refuse_transforms("ball_query")
     xyz, query_xyz = _arguments(points, batch_offsets, queries, query_offsets, radius, max_points)
     if _native.use_native("ball_query", points):
         return Ball(*torch.ops.pred.ball_query(xyz, batch_offsets, query_xyz, query_offsets, float(radius), max_points))
@@ -82,10 +84,10 @@ def _arguments(
     points: Tensor, batch_offsets: Tensor, queries: Tensor, query_offsets: Tensor, radius: float, max_points: int
 ) -> tuple[Tensor, Tensor]:
     found = check_queries("ball_query", points, batch_offsets, queries, query_offsets)
+    check_number("ball_query", "radius", radius)
     if not radius > 0:
         raise ValueError(f"ball_query: radius must be positive, got {radius}")
-    if max_points < 0:
-        raise ValueError(f"ball_query: max_points must not be negative, got {max_points}")
+    check_count("ball_query", "max_points", max_points)
     return found
 
 

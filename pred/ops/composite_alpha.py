@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._composite import Composite, composite_arguments, composite_reference, layout
+from pred.ops._check import check_number
+from pred.ops._composite import Composite, check_options, composite_arguments, composite_reference, layout
 
 
 def composite_alpha(
@@ -59,6 +60,9 @@ def composite_alpha(
     Differentiable once in ``alpha``, ``t`` and ``values``, through all outputs. The derivative divides by nothing: it
     is exact where opacities are 0 or 1. Deterministic for any thread count.
     """
+    _native.refuse_transforms("composite_alpha")
+    check_options("composite_alpha", depth_at, normalize_depth, normalize_eps)
+    alpha, t, values = _arguments(alpha, t, values, ray_offsets, transmittance_eps)
     if not _native.use_native("composite_alpha", alpha):
         return composite_alpha_reference(
             alpha,
@@ -70,7 +74,6 @@ def composite_alpha(
             normalize_depth=normalize_depth,
             normalize_eps=normalize_eps,
         )
-    alpha, t, values = _arguments(alpha, t, values, ray_offsets, transmittance_eps, depth_at)
     weights, of_t, opacity, of_values = torch.ops.pred.composite_alpha(
         alpha, t, values, ray_offsets, transmittance_eps, depth_at == "mid"
     )
@@ -95,7 +98,8 @@ def composite_alpha_reference(
 
     Packed rays become rows as long as the longest ray.
     """
-    alpha, t, values = _arguments(alpha, t, values, ray_offsets, transmittance_eps, depth_at)
+    check_options("composite_alpha", depth_at, normalize_depth, normalize_eps)
+    alpha, t, values = _arguments(alpha, t, values, ray_offsets, transmittance_eps)
     places = layout(alpha, ray_offsets)
     alpha = places.spread_or_zero(alpha)
     # In double: in float32 the product would lose opacities below 1e-7.
@@ -111,11 +115,11 @@ def _arguments(
     values: Tensor | None,
     ray_offsets: Tensor | None,
     transmittance_eps: float,
-    depth_at: str,
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    check_number("composite_alpha", "transmittance_eps", transmittance_eps)
     if not -math.inf < transmittance_eps < math.inf:
         raise ValueError(f"composite_alpha: transmittance_eps must be finite, got {transmittance_eps}")
-    return composite_arguments("composite_alpha", "alpha", alpha, t, values, ray_offsets, depth_at)
+    return composite_arguments("composite_alpha", "alpha", alpha, t, values, ray_offsets)
 
 
 def _fake(

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import check_tensors
-from pred.ops._composite import Composite, composite_arguments, composite_reference, layout
+from pred.ops._check import check_flags, check_tensors
+from pred.ops._composite import Composite, check_options, composite_arguments, composite_reference, layout
 from pred.ops.sdf_to_alpha import sdf_arguments, sdf_to_alpha_reference, valid_sharpness
 
 
@@ -66,6 +66,9 @@ def composite_rays(
     Differentiable once in ``sdf``, ``inv_s``, ``t`` and ``values``, through all outputs; exact for opacities 0 and 1.
     Deterministic for any thread count.
     """
+    _native.refuse_transforms("composite_rays")
+    check_options("composite_rays", depth_at, normalize_depth, normalize_eps)
+    sdf, inv_s, t, values = _arguments(sdf, inv_s, t, values, ray_offsets, last, detach_sdf, detach_inv_s)
     if not _native.use_native("composite_rays", sdf):
         return composite_rays_reference(
             sdf,
@@ -80,7 +83,6 @@ def composite_rays(
             detach_inv_s=detach_inv_s,
             normalize_eps=normalize_eps,
         )
-    sdf, inv_s, t, values = _arguments(sdf, inv_s, t, values, ray_offsets, depth_at, last, detach_sdf, detach_inv_s)
     weights, depth, opacity, rendered, _ = _native.checked(
         torch.ops.pred.composite_rays, sdf, inv_s, t, values, ray_offsets, depth_at == "mid", last == "opaque"
     )
@@ -107,7 +109,8 @@ def composite_rays_reference(
 
     Packed rays become rows as long as the longest ray.
     """
-    sdf, inv_s, t, values = _arguments(sdf, inv_s, t, values, ray_offsets, depth_at, last, detach_sdf, detach_inv_s)
+    check_options("composite_rays", depth_at, normalize_depth, normalize_eps)
+    sdf, inv_s, t, values = _arguments(sdf, inv_s, t, values, ray_offsets, last, detach_sdf, detach_inv_s)
     inv_s = valid_sharpness("composite_rays", inv_s)
     places = layout(sdf, ray_offsets)
     sdf = places.spread(sdf)
@@ -131,14 +134,14 @@ def _arguments(
     t: Tensor,
     values: Tensor | None,
     ray_offsets: Tensor | None,
-    depth_at: str,
     last: str,
     detach_sdf: bool,
     detach_inv_s: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     op = "composite_rays"
     check_tensors(op, t=t)
-    sdf, ranges, values = composite_arguments(op, "sdf", sdf, t, values, ray_offsets, depth_at)
+    check_flags(op, detach_sdf=detach_sdf, detach_inv_s=detach_inv_s)
+    sdf, ranges, values = composite_arguments(op, "sdf", sdf, t, values, ray_offsets)
     assert ranges is not None
     _, inv_s = sdf_arguments(op, sdf if ray_offsets is None else sdf[None], inv_s, "pair", last)
     if detach_sdf:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import check_offsets, check_tensors
+from pred.ops._check import check_count, check_offsets, check_tensors
 from pred.ops._clouds import frame_slices, positions, squared_distances
 
 
@@ -44,6 +44,7 @@ def farthest_point_sample(
     may be infinitely far from each other. Not differentiable: the output is integer. Equal bits for any thread count
     and instruction set.
     """
+    _native.refuse_transforms("farthest_point_sample")
     xyz = _arguments(points, batch_offsets, num_samples, start)
     if _native.use_native("farthest_point_sample", points):
         out: Tensor = torch.ops.pred.farthest_point_sample(xyz, batch_offsets, num_samples, start)
@@ -66,9 +67,8 @@ def _arguments(points: Tensor, batch_offsets: Tensor, num_samples: int, start: i
     check_tensors(op, points=points, batch_offsets=batch_offsets)
     xyz = positions(op, "points", points)
     check_offsets(op, "batch_offsets", batch_offsets, "BN", "points", points)
-    for name, number in (("num_samples", num_samples), ("start", start)):
-        if number < 0:
-            raise ValueError(f"{op}: {name} must not be negative, got {number}")
+    check_count(op, "num_samples", num_samples)
+    check_count(op, "start", start)
     return xyz
 
 

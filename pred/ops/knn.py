@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
+from pred.ops._check import check_count
 from pred.ops._clouds import check_queries, frame_slices, squared_distances
 
 _CHUNK = 2**22
@@ -54,6 +55,7 @@ def knn(
     Not differentiable, the distances neither: compute them again from the indices. Equal bits for any thread count and
     instruction set.
     """
+    _native.refuse_transforms("knn")
     xyz, query_xyz = _arguments(points, batch_offsets, queries, query_offsets, k)
     if _native.use_native("knn", points):
         return Neighbors(*torch.ops.pred.knn(xyz, batch_offsets, query_xyz, query_offsets, k))
@@ -76,8 +78,7 @@ def _arguments(
     points: Tensor, batch_offsets: Tensor, queries: Tensor, query_offsets: Tensor, k: int
 ) -> tuple[Tensor, Tensor]:
     found = check_queries("knn", points, batch_offsets, queries, query_offsets)
-    if k < 0:
-        raise ValueError(f"knn: k must not be negative, got {k}")
+    check_count("knn", "k", k)
     return found
 
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
+from pred.ops._check import check_count
 from pred.ops.sample_pdf import pdf_arguments, samples_reference
 
 
@@ -52,6 +53,8 @@ def resample_rays(
 
     Deterministic for any thread count.
     """
+    _native.refuse_transforms("resample_rays")
+    check_count("resample_rays", "num_samples", num_samples)
     rule = (mode, histogram_padding, eps, min_width)
     t, weights, u = pdf_arguments("resample_rays", "t", t, weights, num_samples, u, *rule)
     if not _native.use_native("resample_rays", t):
@@ -72,6 +75,7 @@ def resample_rays_reference(
     min_width: float = 0.0,
 ) -> Tensor:  # [R, S + num_samples]
     """Plain PyTorch form of :func:`resample_rays`: search, interpolate, sort."""
+    check_count("resample_rays", "num_samples", num_samples)
     rule = (mode, histogram_padding, eps, min_width)
     t, weights, u = pdf_arguments("resample_rays", "t", t, weights, num_samples, u, *rule)
     return _merged(t, weights, u, *rule)

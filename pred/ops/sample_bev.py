@@ -42,9 +42,10 @@ def sample_bev(
     border padding it is 0, as in ``F.grid_sample``. The gradient of a half-precision map is summed in float32 over
     all samples and rounded once. Deterministic for any number of threads.
     """
+    _native.refuse_transforms("sample_bev")
+    bev, grid = _arguments("sample_bev", bev, grid, padding_mode, align_corners)
     if not _native.use_native("sample_bev", bev):
         return sample_bev_reference(bev, grid, padding_mode, align_corners)
-    bev, grid = _arguments("sample_bev", bev, grid, padding_mode)
     out: Tensor = torch.ops.pred.sample_bev(bev, grid, padding_mode == "border", align_corners)
     return out
 
@@ -74,9 +75,10 @@ def sample_bev_with_grad(
     Differentiable once in ``bev`` and ``grid``, through both outputs; a second derivative raises. Kinks,
     rounding and determinism as in :func:`sample_bev`.
     """
+    _native.refuse_transforms("sample_bev_with_grad")
+    bev, grid = _arguments("sample_bev_with_grad", bev, grid, padding_mode, align_corners)
     if not _native.use_native("sample_bev_with_grad", bev):
         return sample_bev_with_grad_reference(bev, grid, padding_mode, align_corners)
-    bev, grid = _arguments("sample_bev_with_grad", bev, grid, padding_mode)
     return SampledWithGrad(*torch.ops.pred.sample_bev_with_grad(bev, grid, padding_mode == "border", align_corners))
 
 
@@ -87,7 +89,7 @@ def sample_bev_reference(
     align_corners: bool = False,
 ) -> Tensor:  # [B, N, C]
     """Plain PyTorch form of :func:`sample_bev`: by its definition, differentiable any number of times."""
-    bev, grid = _arguments("sample_bev", bev, grid, padding_mode)
+    bev, grid = _arguments("sample_bev", bev, grid, padding_mode, align_corners)
     (values,) = reference(bev, grid, padding_mode == "border", align_corners, with_grad=False)
     return values
 
@@ -99,13 +101,13 @@ def sample_bev_with_grad_reference(
     align_corners: bool = False,
 ) -> SampledWithGrad:  # [B, N, C], [B, N, 2, C]
     """Plain PyTorch form of :func:`sample_bev_with_grad`, differentiable any number of times."""
-    bev, grid = _arguments("sample_bev_with_grad", bev, grid, padding_mode)
+    bev, grid = _arguments("sample_bev_with_grad", bev, grid, padding_mode, align_corners)
     values, *grads = reference(bev, grid, padding_mode == "border", align_corners, with_grad=True)
     return SampledWithGrad(values, torch.stack(grads, dim=2))
 
 
-def _arguments(op: str, bev: Tensor, grid: Tensor, padding_mode: str) -> tuple[Tensor, Tensor]:
-    return arguments(op, "bev", 2, bev, grid, padding_mode)
+def _arguments(op: str, bev: Tensor, grid: Tensor, padding_mode: str, align_corners: bool) -> tuple[Tensor, Tensor]:
+    return arguments(op, "bev", 2, bev, grid, padding_mode, align_corners)
 
 
 register("sample_bev")

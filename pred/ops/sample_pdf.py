@@ -10,7 +10,17 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, as_geometry, check_choice, check_dtype, check_like, check_shape, check_tensors
+from pred.ops._check import (
+    FLOATING,
+    as_geometry,
+    check_choice,
+    check_count,
+    check_dtype,
+    check_like,
+    check_number,
+    check_shape,
+    check_tensors,
+)
 
 MODES = ("exact", "neus", "nerfstudio")
 
@@ -64,6 +74,7 @@ def sample_pdf(
 
     Deterministic for any thread count.
     """
+    _native.refuse_transforms("sample_pdf")
     rule = (mode, histogram_padding, eps, min_width)
     edges, weights, u = pdf_arguments("sample_pdf", "edges", edges, weights, num_samples, u, *rule)
     if not _native.use_native("sample_pdf", edges):
@@ -150,6 +161,7 @@ def pdf_arguments(
     check_tensors(op, **{name: edges, "weights": weights}, **({} if u is None else {"u": u}))
     check_choice(op, "mode", mode, MODES)
     for option, value in (("histogram_padding", histogram_padding), ("eps", eps), ("min_width", min_width)):
+        check_number(op, option, value)
         if not 0 <= value < math.inf:
             raise ValueError(f"{op}: {option} must be finite and not negative, got {value}")
     edges, weights = (
@@ -165,8 +177,8 @@ def pdf_arguments(
             f"{op}: weights must have shape [{rays}, {samples}] or [{rays}, {samples - 1}], got {list(weights.shape)}"
         )
     check_like(op, "weights", weights, name, edges)
-    if num_samples is not None and num_samples < 0:
-        raise ValueError(f"{op}: num_samples must be 0 or more, got {num_samples}")
+    if num_samples is not None:
+        check_count(op, "num_samples", num_samples)
     if u is not None:
         u = as_geometry(u.detach())
         size = u.shape[-1] if num_samples is None and u.dim() > 0 else num_samples

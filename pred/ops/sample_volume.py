@@ -42,9 +42,10 @@ def sample_volume(
     border padding it is 0, as in ``F.grid_sample``. The gradient of a half-precision map is summed in float32 over
     all samples and rounded once. Deterministic for any number of threads.
     """
+    _native.refuse_transforms("sample_volume")
+    volume, grid = _arguments("sample_volume", volume, grid, padding_mode, align_corners)
     if not _native.use_native("sample_volume", volume):
         return sample_volume_reference(volume, grid, padding_mode, align_corners)
-    volume, grid = _arguments("sample_volume", volume, grid, padding_mode)
     out: Tensor = torch.ops.pred.sample_volume(volume, grid, padding_mode == "border", align_corners)
     return out
 
@@ -74,9 +75,10 @@ def sample_volume_with_grad(
     Differentiable once in ``volume`` and ``grid``, through both outputs; a second derivative raises. Kinks,
     rounding and determinism as in :func:`sample_volume`.
     """
+    _native.refuse_transforms("sample_volume_with_grad")
+    volume, grid = _arguments("sample_volume_with_grad", volume, grid, padding_mode, align_corners)
     if not _native.use_native("sample_volume_with_grad", volume):
         return sample_volume_with_grad_reference(volume, grid, padding_mode, align_corners)
-    volume, grid = _arguments("sample_volume_with_grad", volume, grid, padding_mode)
     return SampledWithGrad(
         *torch.ops.pred.sample_volume_with_grad(volume, grid, padding_mode == "border", align_corners)
     )
@@ -89,7 +91,7 @@ def sample_volume_reference(
     align_corners: bool = False,
 ) -> Tensor:  # [B, N, C]
     """Plain PyTorch form of :func:`sample_volume`: by its definition, differentiable any number of times."""
-    volume, grid = _arguments("sample_volume", volume, grid, padding_mode)
+    volume, grid = _arguments("sample_volume", volume, grid, padding_mode, align_corners)
     (values,) = reference(volume, grid, padding_mode == "border", align_corners, with_grad=False)
     return values
 
@@ -101,13 +103,13 @@ def sample_volume_with_grad_reference(
     align_corners: bool = False,
 ) -> SampledWithGrad:  # [B, N, C], [B, N, 3, C]
     """Plain PyTorch form of :func:`sample_volume_with_grad`, differentiable any number of times."""
-    volume, grid = _arguments("sample_volume_with_grad", volume, grid, padding_mode)
+    volume, grid = _arguments("sample_volume_with_grad", volume, grid, padding_mode, align_corners)
     values, *grads = reference(volume, grid, padding_mode == "border", align_corners, with_grad=True)
     return SampledWithGrad(values, torch.stack(grads, dim=2))
 
 
-def _arguments(op: str, volume: Tensor, grid: Tensor, padding_mode: str) -> tuple[Tensor, Tensor]:
-    return arguments(op, "volume", 3, volume, grid, padding_mode)
+def _arguments(op: str, volume: Tensor, grid: Tensor, padding_mode: str, align_corners: bool) -> tuple[Tensor, Tensor]:
+    return arguments(op, "volume", 3, volume, grid, padding_mode, align_corners)
 
 
 register("sample_volume")

@@ -17,6 +17,7 @@ from pred.ops._check import (
     check_choice,
     check_dtype,
     check_like,
+    check_number,
     check_offsets,
     check_shape,
     check_tensors,
@@ -81,8 +82,21 @@ def sdf_to_alpha(
     Differentiable once in ``sdf``, ``inv_s``, ``cosine`` and ``section_length``. The derivative of ``max`` at a tie and
     of ``relu`` at 0 is 0; that of ``clip`` on its bounds is 1, as in PyTorch. Deterministic for any thread count.
     """
-    use_native = _native.use_native("sdf_to_alpha", sdf)
-    if not use_native:
+    _native.refuse_transforms("sdf_to_alpha")
+    _check_mode(mode, inv_s, last, cosine, section_length, cos_anneal, eps, ray_offsets)
+    arguments: tuple[Any, ...]
+    if inv_s is None:
+        op, arguments = "sdf_to_alpha_density", (*_elementwise(sdf, section_length=section_length),)
+    elif mode == "section":
+        sharpness, tensors = _section(sdf, inv_s, cosine, section_length)
+        op, arguments = (
+            "sdf_to_alpha_section",
+            (tensors[0], sharpness, *tensors[1:], _scalar(cos_anneal, tensors[0]), eps),
+        )
+    else:
+        checked = sdf_arguments("sdf_to_alpha", sdf, inv_s, mode, last, ray_offsets)
+        op, arguments = "sdf_to_alpha", (*checked, last == "opaque", ray_offsets)
+    if not _native.use_native("sdf_to_alpha", sdf):
         return sdf_to_alpha_reference(
             sdf,
             inv_s,
@@ -94,18 +108,7 @@ def sdf_to_alpha(
             eps=eps,
             ray_offsets=ray_offsets,
         )
-    _check_mode(mode, inv_s, last, cosine, section_length, cos_anneal, eps, ray_offsets)
-    out: Tensor
-    if inv_s is None:
-        out = torch.ops.pred.sdf_to_alpha_density(*_elementwise("density", sdf, section_length=section_length))
-    elif mode == "section":
-        inv_s, (sdf, cosine, length) = _section(sdf, inv_s, cosine, section_length)
-        out = _native.checked(
-            torch.ops.pred.sdf_to_alpha_section, sdf, inv_s, cosine, length, _scalar(cos_anneal, sdf), eps
-        )
-    else:
-        sdf, inv_s = sdf_arguments("sdf_to_alpha", sdf, inv_s, mode, last, ray_offsets)
-        out = _native.checked(torch.ops.pred.sdf_to_alpha, sdf, inv_s, last == "opaque", ray_offsets)
+    out: Tensor = _native.checked(getattr(torch.ops.pred, op), *arguments)
     return out
 
 
@@ -124,7 +127,7 @@ def sdf_to_alpha_reference(
     """Plain PyTorch form of :func:`sdf_to_alpha`, differentiable any number of times."""
     _check_mode(mode, inv_s, last, cosine, section_length, cos_anneal, eps, ray_offsets)
     if inv_s is None:
-        density, length = _elementwise("density", sdf, section_length=section_length)
+        density, length = _elementwise(sdf, section_length=section_length)
         return -torch.expm1(-density * length)
     if mode == "section":
         inv_s, (sdf, cosine, length) = _section(sdf, inv_s, cosine, section_length)
@@ -176,6 +179,8 @@ def _check_mode(
             raise ValueError(f"{op}: {name} must be None in mode {mode!r}, got a value")
     if mode != "pair" and last != "zero":
         raise ValueError(f"{op}: last must be 'zero' in mode {mode!r}, where every sample has an end, got {last!r}")
+    check_number(op, "cos_anneal", cos_anneal)
+    check_number(op, "eps", eps)
     if not 0 <= cos_anneal <= 1:
         raise ValueError(f"{op}: cos_anneal must be in [0, 1], got {cos_anneal}")
     if not 0 <= eps < math.inf:
@@ -187,27 +192,27 @@ def _flat(tensor: Tensor) -> Tensor:
     return as_geometry(tensor[..., 0] if tensor.dim() == 3 and tensor.shape[2] == 1 else tensor)
 
 
-def _elementwise(name: str, first: Tensor, **others: Tensor | None) -> list[Tensor]:
-    """``first``, ``[R, S]`` or ``[P]``, and other tensors of its shape."""
+def _elementwise(sdf: Tensor, **others: Tensor | None) -> list[Tensor]:
+    """``sdf``, or the densities, ``[R, S]`` or ``[P]``, and other tensors of its shape."""
     op = "sdf_to_alpha"
-    check_tensors(op, **{name: first}, **others)
-    first = _flat(first)
-    if first.dim() not in (1, 2):
-        raise ValueError(f"{op}: {name} must have shape [R, S], [R, S, 1] or [P], got {list(first.shape)}")
-    check_dtype(op, name, first, FLOATING)
-    tensors = [first]
-    for other_name, other in others.items():
+    check_tensors(op, sdf=sdf, **others)
+    sdf = _flat(sdf)
+    if sdf.dim() not in (1, 2):
+        raise ValueError(f"{op}: sdf must have shape [R, S], [R, S, 1] or [P], got {list(sdf.shape)}")
+    check_dtype(op, "sdf", sdf, FLOATING)
+    tensors = [sdf]
+    for name, other in others.items():
         assert other is not None  # by _check_mode
         tensors.append(_flat(other))
-        check_shape(op, other_name, tensors[-1], first.shape, f" as {name}")
-        check_like(op, other_name, tensors[-1], name, first)
+        check_shape(op, name, tensors[-1], sdf.shape, " as sdf")
+        check_like(op, name, tensors[-1], "sdf", sdf)
     return tensors
 
 
 def _section(
     sdf: Tensor, inv_s: Tensor | float, cosine: Tensor | None, section_length: Tensor | None
 ) -> tuple[Tensor, list[Tensor]]:
-    tensors = _elementwise("sdf", sdf, cosine=cosine, section_length=section_length)
+    tensors = _elementwise(sdf, cosine=cosine, section_length=section_length)
     return _sharpness("sdf_to_alpha", inv_s, tensors[0]), tensors
 
 
@@ -229,6 +234,7 @@ def sdf_arguments(
 def _sharpness(op: str, inv_s: Tensor | float, sdf: Tensor) -> Tensor:
     """The sharpness as a tensor without dimensions, of the dtype of ``sdf``."""
     if not isinstance(inv_s, Tensor):
+        check_number(op, "inv_s", inv_s)
         if not 0 <= inv_s < math.inf:
             raise ValueError(f"{op}: inv_s must be finite and not negative, got {inv_s}")
         return _scalar(float(inv_s), sdf)

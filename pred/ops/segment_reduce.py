@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, HALF, check_choice, check_dtype, check_shape, check_tensors, widen
+from pred.ops._check import FLOATING, HALF, check_choice, check_count, check_dtype, check_shape, check_tensors, widen
 
 
 def segment_reduce(
@@ -38,9 +38,10 @@ def segment_reduce(
     Differentiable any number of times in ``features``. Of equal maxima the first row takes the gradient; with NaN
     present it is the first NaN. Deterministic for any thread count: rows are added in their order.
     """
+    _native.refuse_transforms("segment_reduce")
+    features = _arguments(features, index, num_segments, reduce)
     if not _native.use_native("segment_reduce", features):
         return segment_reduce_reference(features, index, num_segments, reduce)
-    features = _arguments(features, index, num_segments, reduce)
     out: Tensor = _native.checked(torch.ops.pred.segment_reduce, features, index, num_segments, reduce)[0]
     return out
 
@@ -79,8 +80,7 @@ def _arguments(features: Tensor, index: Tensor, num_segments: int, reduce: str) 
     check_choice(op, "reduce", reduce, ("sum", "mean", "max"))
     if index.device != features.device:
         raise ValueError(f"{op}: index must be on the device of features ({features.device}), got {index.device}")
-    if num_segments < 0:
-        raise ValueError(f"{op}: num_segments must not be negative, got {num_segments}")
+    check_count(op, "num_segments", num_segments)
     return features
 
 

@@ -5,14 +5,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, HALF, check_dtype, check_offsets, check_tensors
+from pred.ops._check import FLOATING, HALF, check_dtype, check_number, check_offsets, check_tensors
 
 _MAX_KEYS = 2**62
 _MAX_CELLS = 2**30
@@ -57,6 +57,7 @@ def voxelize(
 
     Not differentiable: the outputs are integers. Equal bits for any thread count and instruction set.
     """
+    _native.refuse_transforms("voxelize")
     size, bounds, grid = check_voxelize_arguments("voxelize", points, batch_offsets, voxel_size, point_range)
     if _native.use_native("voxelize", points):
         return Voxels(*torch.ops.pred.voxelize(points, batch_offsets, size, bounds, grid))
@@ -115,6 +116,10 @@ def check_voxelize_arguments(
 
 
 def _floats(op: str, name: str, values: Sequence[float], count: int) -> list[float]:
+    if not isinstance(values, Iterable):
+        raise TypeError(f"{op}: {name} must hold {count} numbers, got {type(values).__name__}")
+    for value in (values := list(values)):
+        check_number(op, name, value)
     floats = [float(value) for value in values]
     if len(floats) != count or not all(math.isfinite(value) for value in floats):
         raise ValueError(f"{op}: {name} must hold {count} finite numbers, got {floats}")

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import check_tensors, widen
+from pred.ops._check import check_count, check_tensors, widen
 from pred.ops.voxelize import check_voxelize_arguments, voxelize_reference
 
 
@@ -64,12 +64,12 @@ def voxelize_hard(
     ``voxels`` is differentiable in ``points`` any number of times: a kept point takes the gradient of its row, a
     dropped one 0. Equal bits for any thread count and instruction set.
     """
+    _native.refuse_transforms("voxelize_hard")
     check_tensors("voxelize_hard", points=points, batch_offsets=batch_offsets)
     points = widen(points)
     size, bounds, grid = check_voxelize_arguments("voxelize_hard", points, batch_offsets, voxel_size, point_range)
-    for name, limit in (("max_points", max_points), ("max_voxels", max_voxels)):
-        if limit < 1:
-            raise ValueError(f"voxelize_hard: {name} must be at least 1, got {limit}")
+    check_count("voxelize_hard", "max_points", max_points, least=1)
+    check_count("voxelize_hard", "max_voxels", max_voxels, least=1)
     if _native.use_native("voxelize_hard", points):
         out = torch.ops.pred.voxelize_hard(points, batch_offsets, size, bounds, grid, max_points, max_voxels)
         return HardVoxels(*out[:3])

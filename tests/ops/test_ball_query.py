@@ -147,7 +147,7 @@ def test_errors(backend: str) -> None:
     for wrong in (0.0, -1.0, math.nan):
         with pytest.raises(ValueError, match=f"ball_query: radius must be positive, got {wrong}"):
             ball_query(points, batch, points, batch, wrong, 3)
-    with pytest.raises(ValueError, match="ball_query: max_points must not be negative, got -1"):
+    with pytest.raises(ValueError, match="ball_query: max_points must be at least 0, got -1"):
         ball_query(points, batch, points, batch, 1.0, -1)
 
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -132,6 +133,41 @@ def test_vmap_is_refused_by_name(backend: str, example: Example) -> None:
     batched = {name: torch.stack([value, value]) for name, value in tensors.items()}
     with pytest.raises(RuntimeError, match=rf"{example.op}\w*: torch.vmap is not supported"):
         torch.vmap(lambda x: tuple(outputs(example.native(**x, **rest)).values()))(batched)
+
+
+@every_example
+def test_wrong_tensors_are_named(backend: str, example: Example) -> None:
+    """Another rank, dtype, device or type: ``op: argument must <rule>, got <fact>``, from both backends."""
+    arguments = example.example(6)
+    tensors = {name: value for name, value in arguments.items() if isinstance(value, Tensor)}
+    for name, value in tensors.items():
+        wrong: dict[str, Any] = {"list": [value.tolist()], "dtype": value.bool()}
+        if value.numel() != 1:  # a number may have any shape
+            wrong["rank"] = value[None, None, None]
+        if len(tensors) > 1:
+            wrong["device"] = value.to("meta")
+        for what, replacement in wrong.items():
+            names = "|".join(tensors)
+            with pytest.raises((ValueError, TypeError), match=rf"^{example.op}: ({names}) must .*, got ") as raised:
+                example.native(**{**arguments, name: replacement})
+            assert isinstance(raised.value, TypeError if what in ("list", "dtype") else ValueError), f"{what} of {name}"
+
+
+WRONG_PLAIN: dict[type, tuple[Any, ...]] = {bool: ("yes", None), int: (2.5, "2", None), float: ("2", [2.0])}
+
+
+@every_example
+def test_wrong_plain_arguments_are_named(backend: str, example: Example) -> None:
+    """The same for numbers, counts and switches."""
+    arguments = example.example(6)
+    parameters = inspect.signature(example.native).parameters
+    plain = {name: parameter.default for name, parameter in parameters.items()} | arguments
+    for name, value in plain.items():
+        for replacement in WRONG_PLAIN.get(type(value), ()):
+            if replacement is None and parameters[name].default is None:
+                continue
+            with pytest.raises((TypeError, ValueError), match=rf"^{example.op}: {name} must .*, got "):
+                example.native(**{**arguments, name: replacement})
 
 
 @every_example

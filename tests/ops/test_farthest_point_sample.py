@@ -137,9 +137,9 @@ def test_errors(backend: str) -> None:
     for wrong in ([], [0], [1, 10], [0, 9], [0, 7, 5, 10], [0, -1, 10]):
         with pytest.raises(ValueError, match="farthest_point_sample: batch_offsets must"):
             farthest_point_sample(points, torch.tensor(wrong, dtype=torch.int64), 3)
-    with pytest.raises(ValueError, match="farthest_point_sample: num_samples must not be negative, got -1"):
+    with pytest.raises(ValueError, match="farthest_point_sample: num_samples must be at least 0, got -1"):
         farthest_point_sample(points, batch, -1)
-    with pytest.raises(ValueError, match="farthest_point_sample: start must not be negative, got -2"):
+    with pytest.raises(ValueError, match="farthest_point_sample: start must be at least 0, got -2"):
         farthest_point_sample(points, batch, 3, start=-2)
 
 

@@ -170,7 +170,7 @@ def test_errors(backend: str) -> None:
             knn(points, torch.tensor(wrong, dtype=torch.int64), points, batch, 3)
         with pytest.raises(ValueError, match="knn: query_offsets must"):
             knn(points, batch, points, torch.tensor(wrong, dtype=torch.int64), 3)
-    with pytest.raises(ValueError, match="knn: k must not be negative, got -1"):
+    with pytest.raises(ValueError, match="knn: k must be at least 0, got -1"):
         knn(points, batch, points, batch, -1)
 
 

@@ -228,7 +228,7 @@ def test_errors(backend: str) -> None:
         resample_rays(t, weights[:, 2:], 4)
     with pytest.raises(ValueError, match="resample_rays: t must have at least 2 samples per ray, got 1"):
         resample_rays(t[:, :1], weights[:, :1], 4)
-    with pytest.raises(ValueError, match="resample_rays: num_samples must be 0 or more, got -1"):
+    with pytest.raises(ValueError, match="resample_rays: num_samples must be at least 0, got -1"):
         resample_rays(t, weights, -1)
     with pytest.raises(TypeError, match="resample_rays: weights must have the dtype of t"):
         resample_rays(t, weights.float(), 4)

@@ -343,7 +343,7 @@ def test_errors(backend: str) -> None:
         sample_pdf(edges, weights[:, 2:], 4)
     with pytest.raises(ValueError, match="sample_pdf: edges must have at least 2 samples per ray, got 1"):
         sample_pdf(edges[:, :1], weights[:, :1], 4)
-    with pytest.raises(ValueError, match="sample_pdf: num_samples must be 0 or more, got -1"):
+    with pytest.raises(ValueError, match="sample_pdf: num_samples must be at least 0, got -1"):
         sample_pdf(edges, weights, -1)
     with pytest.raises(ValueError, match="sample_pdf: num_samples or u must be given, got neither"):
         sample_pdf(edges, weights)

@@ -219,7 +219,7 @@ def test_errors(backend: str) -> None:
         segment_reduce(features, index.int(), 12)
     with pytest.raises(ValueError, match="segment_reduce: reduce must be one of sum, mean, max, got 'min'"):
         segment_reduce(features, index, 12, "min")
-    with pytest.raises(ValueError, match="segment_reduce: num_segments must not be negative, got -1"):
+    with pytest.raises(ValueError, match="segment_reduce: num_segments must be at least 0, got -1"):
         segment_reduce(features, index, -1)
     for wrong in (12, -2, 2**62, -(2**62)):
         index[[17, 30]] = wrong
