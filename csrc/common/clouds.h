@@ -12,8 +12,8 @@
 
 namespace pred {
 
-// Checked and contiguous; `letter` names the number of rows in the message. Rows are numbered in 31 bits.
-inline Tensor frame_offsets(const char* op, const char* name, const Tensor& offsets_in, char letter, int64_t num_rows) {
+// Checked and contiguous; `letter` names the number of rows in the message.
+inline Tensor read_offsets(const char* op, const char* name, const Tensor& offsets_in, char letter, int64_t num_rows) {
   check_cpu_tensor(op, name, offsets_in, 1, ScalarType::Long);
   const Tensor offsets = torch::stable::contiguous(offsets_in);
   const int64_t* offset = offsets.const_data_ptr<int64_t>();
@@ -21,8 +21,13 @@ inline Tensor frame_offsets(const char* op, const char* name, const Tensor& offs
   PRED_CHECK(num_frames >= 0 && offset[0] == 0 && std::is_sorted(offset, offset + num_frames + 1) &&
                  offset[num_frames] == num_rows,
              op, ": ", name, " must ascend from 0 to ", letter, "=", num_rows);
-  PRED_CHECK(num_rows < int64_t(1) << 31, op, ": ", name, " must divide fewer than 2^31 rows, got ", num_rows);
   return offsets;
+}
+
+// The same for points, whose rows are numbered in 31 bits.
+inline Tensor frame_offsets(const char* op, const char* name, const Tensor& offsets_in, char letter, int64_t num_rows) {
+  PRED_CHECK(num_rows < int64_t(1) << 31, op, ": ", name, " must divide fewer than 2^31 rows, got ", num_rows);
+  return read_offsets(op, name, offsets_in, letter, num_rows);
 }
 
 // Calls body(frame, begin, end) for the pieces of [begin, end) that belong to one frame each, in order.

@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "common/check.h"
+#include "common/clouds.h"
 #include "common/parallel.h"
 #include "ops/composite.h"
 
@@ -81,14 +82,10 @@ struct CompositeInputs {
       : op(name), has_t(t), has_values(values) {
     check_cpu_tensor(op, source_name, source, offsets ? 1 : 2, dtype);
     if (offsets) {
-      check_cpu_tensor(op, "ray_offsets", *offsets, 1, ScalarType::Long);
-      PRED_CHECK(offsets->size(0) > 0, op, ": ray_offsets must have shape [R + 1] with R >= 0, got [0]");
-      num_rays = offsets->size(0) - 1;
+      const Tensor checked = read_offsets(op, "ray_offsets", *offsets, 'P', source.size(0));
+      num_rays = checked.size(0) - 1;
       samples = {source.size(0)};
-      args.rows = {keep<int64_t>(*offsets), 0};
-      const int64_t* begin = args.rows.offsets;
-      PRED_CHECK(begin[0] == 0 && begin[num_rays] == samples[0] && std::is_sorted(begin, begin + num_rays + 1), op,
-                 ": ray_offsets must ascend from 0 to P=", samples[0]);
+      args.rows = {keep<int64_t>(checked), 0};
     } else {
       num_rays = source.size(0);
       samples = {num_rays, source.size(1)};

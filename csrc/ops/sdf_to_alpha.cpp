@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "common/check.h"
+#include "common/clouds.h"
 #include "common/parallel.h"
 
 namespace pred {
@@ -37,13 +38,9 @@ struct Rays {
     args = {sdf.const_data_ptr<T>(), nullptr, read_sharpness<T>(op, inv_s, sdf.scalar_type()), last_opaque};
     int64_t num_rays;
     if (ray_offsets) {
-      check_cpu_tensor(op, "ray_offsets", *ray_offsets, 1, ScalarType::Long);
-      kept = torch::stable::contiguous(*ray_offsets);
+      kept = read_offsets(op, "ray_offsets", *ray_offsets, 'P', sdf.size(0));
       args.ray_offsets = kept.const_data_ptr<int64_t>();
       num_rays = kept.size(0) - 1;
-      PRED_CHECK(num_rays >= 0 && args.ray_offsets[0] == 0 && args.ray_offsets[num_rays] == sdf.size(0) &&
-                     std::is_sorted(args.ray_offsets, args.ray_offsets + num_rays + 1),
-                 op, ": ray_offsets must ascend from 0 to P=", sdf.size(0));
     } else {
       num_rays = sdf.size(0);
       made.resize(num_rays + 1);
