@@ -41,9 +41,8 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "(Tensor, Tensor, Tensor)");
   m.def("sample_volume_with_grad(Tensor volume, Tensor grid, bool border, bool align_corners) -> (Tensor, Tensor)");
   m.def(
-      "sample_volume_with_grad_backward(Tensor? grad_values, Tensor? grad_grads, Tensor volume, Tensor grid, bool "
-      "border, "
-      "bool align_corners, bool need_volume, bool need_grid) -> (Tensor, Tensor)");
+      "sample_volume_with_grad_backward(Tensor? grad_values, Tensor? grad_grads, Tensor volume, Tensor grid, "
+      "bool border, bool align_corners, bool need_volume, bool need_grid) -> (Tensor, Tensor)");
 
   m.def("segment_reduce(Tensor features, Tensor index, SymInt num_segments, str reduce) -> (Tensor, Tensor)");
   m.def("segment_reduce_backward(Tensor grad, Tensor index, Tensor saved, str reduce) -> Tensor");

@@ -1,7 +1,7 @@
 // Copyright 2026 The PRED authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// A binary heap with the largest entry at its root, in the caller's memory. A Heap has a type Entry,
+// A binary heap with the largest entry at its root, in the caller's memory. For some type Entry a Heap has
 // Entry get(int64_t) const, void set(int64_t, Entry) const and bool less(Entry, Entry) const.
 #pragma once
 

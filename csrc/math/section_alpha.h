@@ -20,9 +20,8 @@ struct SectionShape {
 };
 
 template <typename T>
-struct SectionAlpha {
-  T alpha;
-  T of_sdf, of_cosine, of_length, of_inv_s;  // derivatives
+struct SectionSlopes {
+  T of_sdf, of_cosine, of_length, of_inv_s;  // derivatives of alpha
 };
 
 template <typename T>
@@ -59,12 +58,12 @@ PRED_HOST_DEVICE T section_alpha(const ExpScale<T>& s, SectionShape<T> shape, T 
 }
 
 template <bool kPublished, typename T>
-PRED_HOST_DEVICE SectionAlpha<T> section_alpha_slopes(const ExpScale<T>& s, T inv_s, SectionShape<T> shape, T sdf,
-                                                      T cosine, T length) {
+PRED_HOST_DEVICE SectionSlopes<T> section_alpha_slopes(const ExpScale<T>& s, T inv_s, SectionShape<T> shape, T sdf,
+                                                       T cosine, T length) {
   const T fall = section_fall(shape.anneal, cosine), total = fall * length, half = total * T(0.5);
   const T start_sdf = sdf + half, end_sdf = sdf - half;
   const Phi<T> end = phi(s, end_sdf);
-  SectionAlpha<T> out;
+  SectionSlopes<T> out;
   T of_sdf, of_half, of_inv_s;  // derivatives in s d, in s half, and in s
   if constexpr (kPublished) {
     const Phi<T> start = phi(s, start_sdf);
@@ -72,7 +71,6 @@ PRED_HOST_DEVICE SectionAlpha<T> section_alpha_slopes(const ExpScale<T>& s, T in
     const bool free = ratio >= T(0) && ratio <= T(1);
     const T of_start = free ? start.free * start.occupied * scale * (end.free * scale) : T(0);
     const T of_end = free ? -(end.free * end.occupied * scale) : T(0);
-    out.alpha = clip01(ratio);
     of_sdf = of_start + of_end;
     of_half = of_start - of_end;
     of_inv_s = of_start * start_sdf + of_end * end_sdf;
@@ -80,7 +78,6 @@ PRED_HOST_DEVICE SectionAlpha<T> section_alpha_slopes(const ExpScale<T>& s, T in
     const PairAlpha<T> pair = alpha_of_rise(s, -total, end);
     const T of_total = total < T(0) ? T(0) : end.occupied * pair.decay;
     const T of_end = -(end.occupied * end.free * pair.lost);
-    out.alpha = pair.alpha;
     of_sdf = of_end;
     of_half = T(2) * of_total - of_end;
     of_inv_s = of_total * total + of_end * end_sdf;

@@ -9,7 +9,7 @@
 #pragma once
 
 #include <algorithm>
-#include <limits>
+#include <cmath>
 #include <memory>
 #include <vector>
 

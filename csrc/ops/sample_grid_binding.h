@@ -4,7 +4,7 @@
 // The bindings of sample_bev and sample_volume. `Op` names one of them:
 //   static constexpr int kAxes;                     // 2 or 3
 //   static constexpr const char *kName, *kMap;      // the op and its first argument
-//   template <typename S> static const SampleGridKernels<S, kAxes>& kernels();
+//   template <typename S> static const SampleGridKernels<S, kAxes>& table();
 #pragma once
 
 #include <torch/csrc/stable/library.h>

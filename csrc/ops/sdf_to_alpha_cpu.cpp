@@ -103,7 +103,7 @@ static inline double section_backward_range(const SectionAlphaArgs<T>& a, const 
     const T* __restrict sdf = a.sdf + block, * __restrict cosine = a.cosine + block, * __restrict length = a.length + block;
     const T* __restrict row = grad + block;
     for (int64_t i = 0; i < count; ++i) {
-      const SectionAlpha<T> slopes = section_alpha_slopes<kPublished>(s, inv_s, shape, sdf[i], cosine[i], length[i]);
+      const SectionSlopes<T> slopes = section_alpha_slopes<kPublished>(s, inv_s, shape, sdf[i], cosine[i], length[i]);
       of_sdf[i] = row[i] * slopes.of_sdf;
       of_cosine[i] = row[i] * slopes.of_cosine;
       of_length[i] = row[i] * slopes.of_length;
