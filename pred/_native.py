@@ -124,15 +124,14 @@ def refuse_transforms(op: str) -> None:
 
 
 def use_native(op: str, tensor: Tensor) -> bool:
-    """Whether ``op`` runs compiled for tensors like this one. What is no tensor goes to the reference, whose checks
-    name it.
+    """Whether ``op`` runs compiled for tensors like this one.
 
     Raises:
         ValueError: ``PRED_BACKEND`` has an unknown value.
         RuntimeError: it is ``native`` and the library or a kernel for the tensor's device is missing.
     """
     backend = _backend()
-    if backend == "reference" or not isinstance(tensor, Tensor):
+    if backend == "reference":
         return False
     if tensor.device.type == "cpu":
         return True

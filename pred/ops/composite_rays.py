@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import check_flags, check_tensors
+from pred.ops._check import check_choice, check_flags, check_tensors
 from pred.ops._composite import Composite, check_options, composite_arguments, composite_reference, layout
-from pred.ops.sdf_to_alpha import sdf_arguments, sdf_to_alpha_reference, valid_sharpness
+from pred.ops.sdf_to_alpha import sdf_to_alpha_reference, sharpness_argument, valid_sharpness
 
 
 def composite_rays(
@@ -143,7 +143,8 @@ def _arguments(
     check_flags(op, detach_sdf=detach_sdf, detach_inv_s=detach_inv_s)
     sdf, ranges, values = composite_arguments(op, "sdf", sdf, t, values, ray_offsets)
     assert ranges is not None
-    _, inv_s = sdf_arguments(op, sdf if ray_offsets is None else sdf[None], inv_s, "pair", last)
+    check_choice(op, "last", last, ("zero", "opaque"))
+    inv_s = sharpness_argument(op, inv_s, sdf)
     if detach_sdf:
         sdf = sdf.detach()
         inv_s = inv_s.detach() if detach_inv_s else inv_s

@@ -94,7 +94,7 @@ def sdf_to_alpha(
             (tensors[0], sharpness, *tensors[1:], _scalar(cos_anneal, tensors[0]), eps),
         )
     else:
-        checked = sdf_arguments("sdf_to_alpha", sdf, inv_s, mode, last, ray_offsets)
+        checked = _pair(sdf, inv_s, ray_offsets)
         op, arguments = "sdf_to_alpha", (*checked, last == "opaque", ray_offsets)
     if not _native.use_native("sdf_to_alpha", sdf):
         return sdf_to_alpha_reference(
@@ -140,7 +140,7 @@ def sdf_to_alpha_reference(
             return _closed_form(inv_s, sdf - half, drop)
         start, end = torch.sigmoid(inv_s * (sdf + half)), torch.sigmoid(inv_s * (sdf - half))
         return ((start - end + eps) / (start + eps)).clip(0, 1)
-    sdf, inv_s = sdf_arguments("sdf_to_alpha", sdf, inv_s, mode, last, ray_offsets)
+    sdf, inv_s = _pair(sdf, inv_s, ray_offsets)
     inv_s = valid_sharpness("sdf_to_alpha", inv_s)
     end_alpha = 1.0 if last == "opaque" else 0.0
     if ray_offsets is None:
@@ -213,25 +213,21 @@ def _section(
     sdf: Tensor, inv_s: Tensor | float, cosine: Tensor | None, section_length: Tensor | None
 ) -> tuple[Tensor, list[Tensor]]:
     tensors = _elementwise(sdf, cosine=cosine, section_length=section_length)
-    return _sharpness("sdf_to_alpha", inv_s, tensors[0]), tensors
+    return sharpness_argument("sdf_to_alpha", inv_s, tensors[0]), tensors
 
 
-def sdf_arguments(
-    op: str, sdf: Tensor, inv_s: Tensor | float, mode: str, last: str, ray_offsets: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Checked ``sdf`` of mode pair as ``[R, S]`` or ``[P]`` and ``inv_s`` without dimensions, of one dtype."""
+def _pair(sdf: Tensor, inv_s: Tensor | float, ray_offsets: Tensor | None) -> tuple[Tensor, Tensor]:
+    op = "sdf_to_alpha"
     check_tensors(op, sdf=sdf, **({} if ray_offsets is None else {"ray_offsets": ray_offsets}))
-    check_choice(op, "mode", mode, ("pair",))
-    check_choice(op, "last", last, ("zero", "opaque"))
     sdf = _flat(sdf)
     check_shape(op, "sdf", sdf, ("R", "S") if ray_offsets is None else ("P",))
     check_dtype(op, "sdf", sdf, FLOATING)
     if ray_offsets is not None:
         check_offsets(op, "ray_offsets", ray_offsets, "RP", "sdf", sdf)
-    return sdf, _sharpness(op, inv_s, sdf)
+    return sdf, sharpness_argument(op, inv_s, sdf)
 
 
-def _sharpness(op: str, inv_s: Tensor | float, sdf: Tensor) -> Tensor:
+def sharpness_argument(op: str, inv_s: Tensor | float, sdf: Tensor) -> Tensor:
     """The sharpness as a tensor without dimensions, of the dtype of ``sdf``."""
     if not isinstance(inv_s, Tensor):
         check_number(op, "inv_s", inv_s)
