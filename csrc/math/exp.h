@@ -4,6 +4,8 @@
 // exp(s x) without branches or library calls. V is float, double, or a vector of either (GCC's vector_size).
 #pragma once
 
+#include <type_traits>
+
 #include "common/host_device.h"
 #include "common/intrinsics.h"
 
@@ -26,18 +28,31 @@ struct Lane<double> {
   using Bits = uint64_t;
 };
 
-// a * b - c, rounded once.
+// The vector of doubles with as many lanes as V, a vector of floats.
+template <typename V>
+struct Doubles {
+  typedef double Type __attribute__((vector_size(2 * sizeof(V))));
+};
+
+// Not rounded before the result is. double: for |a|, |b| < 2^995.
 template <typename V>
 PRED_HOST_DEVICE V fused_multiply_subtract(V a, V b, V c) {
-  // Dekker: both factors are split into halves whose products are exact.
-  using T = typename Lane<V>::Scalar;
-  constexpr T split = sizeof(T) == 4 ? T(4097) : T(134217729);
-  const V a_split = a * split, b_split = b * split;
-  const V a_high = a_split - (a_split - a), b_high = b_split - (b_split - b);
-  const V a_low = a - a_high, b_low = b - b_high;
-  const V product = a * b;
-  const V error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low;
-  return (product - c) + error;
+  if constexpr (std::is_same_v<V, float>) {
+    return float(double(a) * double(b) - double(c));  // the product is exact
+  } else if constexpr (sizeof(typename Lane<V>::Scalar) == 4) {
+    using Wide = typename Doubles<V>::Type;
+    return __builtin_convertvector(
+        __builtin_convertvector(a, Wide) * __builtin_convertvector(b, Wide) - __builtin_convertvector(c, Wide), V);
+  } else {
+    // Dekker: both factors are split into halves whose products are exact.
+    constexpr double split = 134217729;
+    const V a_split = a * split, b_split = b * split;
+    const V a_high = a_split - (a_split - a), b_high = b_split - (b_split - b);
+    const V a_low = a - a_high, b_low = b - b_high;
+    const V product = a * b;
+    const V error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low;
+    return (product - c) + error;
+  }
 }
 
 #if defined(__FMA__) || defined(__CUDACC__)
@@ -101,7 +116,8 @@ PRED_HOST_DEVICE V exp2m1_reduced(V f) {
   }
 }
 
-// A factor s of exponents: s * log2(e) in two parts, and the x below which exp(s x) is 0.
+// A factor s of exponents: s * log2(e) in two parts, and the x below which exp(s x) is 0. Factors whose product with
+// log2(e) would not be finite (double: beyond 2^994) count as the largest for which it is.
 template <typename T>
 struct ExpScale {
   T high, low, lowest;
@@ -110,6 +126,8 @@ struct ExpScale {
 template <typename T>
 PRED_HOST_DEVICE ExpScale<T> exp_scale(T s) {
   constexpr double log2e = 1.4426950408889634, log2e_low = 2.0355273740931033e-17;
+  constexpr T largest = sizeof(T) == 4 ? T(0x1p127) : T(0x1p994);
+  s = s < largest ? s : largest;
   if constexpr (sizeof(T) == 4) {
     const double exact = double(s) * log2e;
     const T high = T(exact);

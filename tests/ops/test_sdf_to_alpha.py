@@ -695,3 +695,26 @@ def test_errors(backend: str) -> None:
         sdf_to_alpha(flat, 2.7, ray_offsets=torch.tensor([0, 8], dtype=torch.int32))
     with pytest.raises(ValueError, match=r"sdf_to_alpha: sdf must have shape \[P\], got \[2, 4\]"):
         sdf_to_alpha(sdf, 2.7, ray_offsets=torch.tensor([0, 4, 8]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_extreme_sharpness_and_distances_give_no_nan(dtype: torch.dtype, level: str) -> None:
+    largest = torch.finfo(dtype).max
+    smallest = torch.finfo(dtype).tiny
+    # Far, near, and on the surface; the sections fall, rise and stay.
+    sdf = torch.tensor([[1.0, 0.5, 0.0, -1.0, 2.0, 2.0], [1e33, 1e-33, -1e-33, -1e33, 0.0, 1e33]], dtype=dtype)
+    for inv_s in (smallest, 1e-20, 1e20, 5.8e34, largest / 2, largest):
+        near = sdf.clone().requires_grad_()
+        sharpness = torch.tensor(inv_s, dtype=dtype, requires_grad=True)
+        alpha = sdf_to_alpha(near, sharpness)
+        expected = reference.sdf_to_alpha(sdf.double() if inv_s < 1e300 else sdf, inv_s)
+        assert_close(alpha, expected.to(dtype), FORWARD[dtype])
+        # At a surface that s makes a step the derivative is as large as s, or infinite; it is never NaN.
+        for grad in torch.autograd.grad(alpha.sum(), (near, sharpness)):
+            assert not grad.isnan().any(), (inv_s, grad)
+
+
+def test_huge_distances_under_a_small_sharpness(level: str) -> None:
+    sdf = torch.tensor([[3e36, 2e36, -1e36, -3e38]])
+    expected = reference.sdf_to_alpha(sdf.double(), 1e-36)
+    assert_close(sdf_to_alpha(sdf, 1e-36), expected.float(), FORWARD[torch.float32])
