@@ -15,18 +15,15 @@ constexpr int64_t kPad = 16;  // at least a vector, on both sides of every row
 
 static inline int64_t padded(int64_t n) { return (n + kPad - 1) / kPad * kPad; }
 
-// `narrowest`: a section less probable counts as empty, so that slopes stay finite.
 template <typename T>
 struct Limits;
 template <>
 struct Limits<float> {
   static constexpr float smallest = __FLT_MIN__, largest = __FLT_MAX__, below_one = 1.0f - __FLT_EPSILON__ / 2;
-  static constexpr float narrowest = 1e-30f;
 };
 template <>
 struct Limits<double> {
   static constexpr double smallest = __DBL_MIN__, largest = __DBL_MAX__, below_one = 1.0 - __DBL_EPSILON__ / 2;
-  static constexpr double narrowest = 1e-300;
 };
 
 // Scratch rows of one ray, with room for a vector on both sides. Sections are padded to whole vectors, by empty ones

@@ -8,6 +8,7 @@
 // vectors: section by section, each overwriting the surplus of the one before, or vector by vector where lanes can be
 // permuted. Rays whose t or u are out of order or not finite, and other rules than the exact one, take the slow path:
 // search, then merge or sort.
+#include "math/heap.h"
 #include "ops/inverse_cdf.h"
 
 namespace pred::PRED_ISA {
@@ -77,8 +78,8 @@ static inline void section_slopes(const Row<T>& row) {
   const T* __restrict t = row.t, * __restrict cdf = row.cdf;
   T* __restrict slope = row.slope;
   for (int64_t i = 0; i < row.size; ++i) {
-    const T width = cdf[i + 1] - cdf[i];
-    slope[i] = width >= Limits<T>::narrowest ? (t[i + 1] - t[i]) / width : T(0);
+    const T steep = (t[i + 1] - t[i]) / (cdf[i + 1] - cdf[i]);
+    slope[i] = steep <= Limits<T>::largest ? steep : T(0);  // of an empty section: infinite or NaN
   }
 }
 
@@ -130,32 +131,14 @@ static inline void merge_permuted(int64_t num_new, const Row<T>& row, int32_t* s
   }
 }
 
+// The numbers themselves as a heap; NaN is the largest.
 template <typename T>
-static inline bool sorts_after(T a, T b) {
-  return a > b || (a != a && b == b);  // NaN last
-}
-
-// Heap sort: in place, and fast for any order.
-template <typename T>
-static void sort(T* x, int64_t n) {
-  for (int64_t top = n / 2 - 1, last = n; last > 1;) {
-    if (top < 0) {  // the heap stands: move its largest to the end
-      --last;
-      const T largest = x[0];
-      x[0] = x[last];
-      x[last] = largest;
-    }
-    int64_t at = top < 0 ? 0 : top;
-    for (int64_t child; (child = 2 * at + 1) < last; at = child) {
-      if (child + 1 < last && sorts_after(x[child + 1], x[child])) ++child;
-      if (!sorts_after(x[child], x[at])) break;
-      const T swap = x[at];
-      x[at] = x[child];
-      x[child] = swap;
-    }
-    if (top >= 0) --top;
-  }
-}
+struct NumberHeap {
+  T* x;
+  T get(int64_t i) const { return x[i]; }
+  void set(int64_t i, T entry) const { x[i] = entry; }
+  static bool less(T a, T b) { return a < b || (b != b && a == a); }
+};
 
 // The merged row of t and of the new samples, which stand in `row` behind the place of t.
 template <typename T>
@@ -171,7 +154,9 @@ static __attribute__((noinline)) void merge_any(const T* t, int64_t num_samples,
     return;
   }
   for (int64_t i = 0; i < num_samples; ++i) row[i] = t[i];
-  sort(row, num_samples + num_new);
+  const NumberHeap<T> heap{row};  // a heap sort is in place, and fast for any order
+  make_heap(heap, num_samples + num_new);
+  sort_heap(heap, num_samples + num_new);
   for (int64_t i = 0; i < num_samples + num_new; ++i) merged[i] = row[i];
 }
 

@@ -211,6 +211,14 @@ def test_compiles_to_one_graph(backend: str) -> None:
     assert_close(compiled(t, weights), resample_rays(t, weights, 7), 1e-13)
 
 
+def test_no_sample_is_lost_where_a_slope_overflows(level: str) -> None:
+    t = torch.tensor([[0.0, 3e38, 3.1e38]])
+    merged = resample_rays(t, torch.tensor([[3e-30, 1.0]]), 4)
+    # All new samples lie in the second section; the old ones stand around them.
+    assert merged[0, 0] == 0 and merged[0, 1] == t[0, 1] and merged[0, -1] == t[0, 2]
+    assert merged.isfinite().all() and (merged.diff() >= 0).all()
+
+
 def test_bitwise_equal_for_any_thread_count(native: None) -> None:
     t, weights = case(500, 96, torch.float32)
     found = []
