@@ -15,22 +15,9 @@
 
 #include "common/isa.h"
 #include "math/half.h"
+#include "ops/ray_rows.h"
 
 namespace pred {
-
-// The samples of ray r are rows [begin, begin + count) of all arrays over samples ("P" in shapes).
-struct RayRows {
-  const int64_t* offsets;  // [R + 1], or null: every ray has num_samples
-  int64_t num_samples;
-};
-
-PRED_HOST_DEVICE int64_t ray_begin(const RayRows& rows, int64_t ray) {
-  return rows.offsets ? rows.offsets[ray] : ray * rows.num_samples;
-}
-
-PRED_HOST_DEVICE int64_t ray_count(const RayRows& rows, int64_t ray) {
-  return rows.offsets ? rows.offsets[ray + 1] - rows.offsets[ray] : rows.num_samples;
-}
 
 template <typename S>
 struct CompositeArgs {

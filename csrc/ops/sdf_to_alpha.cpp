@@ -25,8 +25,7 @@ constexpr int64_t kGroup = 1024;   // samples of the rays that are worked on as 
 // Rays of one length (sdf [R, S]) or of any (sdf [P] and ray_offsets [R + 1]), and their groups, each of whole rays.
 template <typename T>
 struct Rays {
-  Tensor sdf, kept;
-  std::vector<int64_t> made;       // ray_offsets where none were given
+  Tensor sdf, offsets;
   std::vector<int64_t> group_end;  // the ray behind each group
   int64_t largest_group = 0;       // in samples
   PairAlphaArgs<T> args;
@@ -35,24 +34,22 @@ struct Rays {
        const std::optional<Tensor>& ray_offsets) {
     check_cpu_tensor(op, "sdf", sdf_in, ray_offsets ? 1 : 2, sdf_in.scalar_type());
     sdf = torch::stable::contiguous(sdf_in);
-    args = {sdf.const_data_ptr<T>(), nullptr, read_sharpness<T>(op, inv_s, sdf.scalar_type()), last_opaque};
-    int64_t num_rays;
+    args = {{nullptr, 0}, sdf.const_data_ptr<T>(), read_sharpness<T>(op, inv_s, sdf.scalar_type()), last_opaque};
+    int64_t num_rays = sdf.size(0);
     if (ray_offsets) {
-      kept = read_offsets(op, "ray_offsets", *ray_offsets, 'P', sdf.size(0));
-      args.ray_offsets = kept.const_data_ptr<int64_t>();
-      num_rays = kept.size(0) - 1;
+      offsets = read_offsets(op, "ray_offsets", *ray_offsets, 'P', sdf.size(0));
+      args.rows.offsets = offsets.const_data_ptr<int64_t>();
+      num_rays = offsets.size(0) - 1;
     } else {
-      num_rays = sdf.size(0);
-      made.resize(num_rays + 1);
-      for (int64_t ray = 0; ray <= num_rays; ++ray) made[ray] = ray * sdf.size(1);
-      args.ray_offsets = made.data();
+      args.rows.num_samples = sdf.size(1);
     }
-    for (int64_t begin = 0, ray = 1; ray <= num_rays; ++ray) {
-      const int64_t size = args.ray_offsets[ray] - args.ray_offsets[begin];
-      if (ray < num_rays && args.ray_offsets[ray + 1] - args.ray_offsets[begin] <= kGroup) continue;
+    int64_t size = 0;
+    for (int64_t ray = 0; ray < num_rays; ++ray) {
+      size += ray_count(args.rows, ray);
+      if (ray + 1 < num_rays && size + ray_count(args.rows, ray + 1) <= kGroup) continue;
       largest_group = std::max(largest_group, size);
-      group_end.push_back(ray);
-      begin = ray;
+      group_end.push_back(ray + 1);
+      size = 0;
     }
   }
 
@@ -100,10 +97,7 @@ Tensor total(const Tensor& like, bool wanted, const std::vector<double>& parts) 
 // Contiguous, with the dtype and shape of `like`.
 Tensor contiguous_like(const char* op, const char* name, const Tensor& tensor, const Tensor& like) {
   check_cpu_tensor(op, name, tensor, like.dim(), like.scalar_type());
-  for (int64_t dim = 0; dim < like.dim(); ++dim) {
-    PRED_CHECK(tensor.size(dim) == like.size(dim), op, ": ", name, " must have shape ", shape_text(like), ", got ",
-               shape_text(tensor));
-  }
+  check_sizes(op, name, tensor, sizes(like));
   return torch::stable::contiguous(tensor);
 }
 

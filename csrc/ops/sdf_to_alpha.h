@@ -14,14 +14,14 @@
 
 #include "common/isa.h"
 #include "math/section_alpha.h"
+#include "ops/ray_rows.h"
 
 namespace pred {
 
-// Ray r is samples [ray_offsets[r], ray_offsets[r + 1]).
 template <typename T>
 struct PairAlphaArgs {
-  const T* sdf;                // [P]
-  const int64_t* ray_offsets;  // [R + 1]
+  RayRows rows;
+  const T* sdf;  // [P]
   T inv_s;
   bool last_opaque;
 };

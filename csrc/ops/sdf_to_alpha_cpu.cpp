@@ -27,7 +27,7 @@ static inline double sum(const T* __restrict x, int64_t n) {
 
 template <typename T>
 static void pair(const PairAlphaArgs<T>& a, T* alpha, int64_t begin, int64_t end) {
-  const int64_t first = a.ray_offsets[begin], count = a.ray_offsets[end] - first;
+  const int64_t first = ray_begin(a.rows, begin), count = ray_begin(a.rows, end) - first;
   const ExpScale<T> s = exp_scale(a.inv_s);
   const T* __restrict sdf = a.sdf + first;
   T* __restrict out = alpha + first;
@@ -35,15 +35,15 @@ static void pair(const PairAlphaArgs<T>& a, T* alpha, int64_t begin, int64_t end
     out[i] = pair_alpha(s, sdf[i], sdf[i + 1], phi(s, sdf[i + 1])).alpha;
   }
   for (int64_t ray = begin; ray < end; ++ray) {
-    if (a.ray_offsets[ray] == a.ray_offsets[ray + 1]) continue;
-    alpha[a.ray_offsets[ray + 1] - 1] = a.last_opaque ? T(1) : T(0);
+    if (ray_count(a.rows, ray) == 0) continue;
+    alpha[ray_begin(a.rows, ray + 1) - 1] = a.last_opaque ? T(1) : T(0);
   }
 }
 
 template <typename T>
 static void pair_backward(const PairAlphaArgs<T>& a, const T* grad, T* grad_sdf, double* grad_inv_s, T* scratch,
                           int64_t begin, int64_t end) {
-  const int64_t first = a.ray_offsets[begin], count = a.ray_offsets[end] - first;
+  const int64_t first = ray_begin(a.rows, begin), count = ray_begin(a.rows, end) - first;
   if (count == 0) return;
   const T inv_s = a.inv_s;
   const ExpScale<T> s = exp_scale(a.inv_s);
@@ -61,9 +61,9 @@ static void pair_backward(const PairAlphaArgs<T>& a, const T* grad, T* grad_sdf,
     scale[i] = slope * (pair.decay * (sdf[i] - sdf[i + 1]) - next.free * pair.lost * sdf[i + 1]);
   }
   for (int64_t ray = begin; ray < end; ++ray) {
-    if (a.ray_offsets[ray] == a.ray_offsets[ray + 1]) continue;
-    const int64_t last = a.ray_offsets[ray + 1] - first - 1;
-    before[a.ray_offsets[ray] - first] = here[last] = scale[last] = T(0);
+    if (ray_count(a.rows, ray) == 0) continue;
+    const int64_t last = ray_begin(a.rows, ray + 1) - first - 1;
+    before[ray_begin(a.rows, ray) - first] = here[last] = scale[last] = T(0);
   }
   if (grad_sdf) {
     T* __restrict out = grad_sdf + first;
