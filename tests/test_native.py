@@ -159,3 +159,12 @@ def test_pure_python_package_works(tmp_path: Path) -> None:
     )
     assert failing.returncode != 0
     assert "PRED_BACKEND=native, but the compiled kernels are missing (the package was never built)" in failing.stderr
+
+
+def test_sizes_whose_products_overflow_are_refused(native: None) -> None:
+    with pytest.raises(KERNEL_ERROR, match=r"composite_alpha: values must have fewer than 2\^31 channels, got 2305843"):
+        values = torch.empty(3, 0, 2**61)
+        torch.ops.pred.composite_alpha(torch.zeros(3, 0), None, values, None, 0.0, False)
+    with pytest.raises(KERNEL_ERROR, match="voxelize_hard: max_points times 4 columns must fit int64, got 2305843"):
+        grid = ([0.1] * 3, [0.0] * 3 + [1.0] * 3, [10] * 3)
+        torch.ops.pred.voxelize_hard(torch.zeros(0, 4), torch.tensor([0, 0]), *grid, 2**61, 1)

@@ -28,13 +28,18 @@ std::string concat(const Parts&... parts) {
   return text.str();
 }
 
-inline std::string shape_text(const Tensor& tensor) {
-  std::string text = "[";
-  for (int64_t dim = 0; dim < tensor.dim(); ++dim) {
-    text += (dim ? ", " : "") + std::to_string(tensor.size(dim));
-  }
-  return text + "]";
+inline std::vector<int64_t> sizes(const Tensor& tensor) {
+  std::vector<int64_t> found;
+  for (int64_t dim = 0; dim < tensor.dim(); ++dim) found.push_back(tensor.size(dim));
+  return found;
 }
+
+inline std::string shape_text(const std::vector<int64_t>& shape) {
+  std::string text;
+  for (const int64_t size : shape) text += (text.empty() ? "" : ", ") + std::to_string(size);
+  return "[" + text + "]";
+}
+inline std::string shape_text(const Tensor& tensor) { return shape_text(sizes(tensor)); }
 
 #define PRED_CHECK(condition, ...)                                              \
   do {                                                                          \
@@ -47,11 +52,9 @@ inline void check_cpu_tensor(const char* op, const char* name, const Tensor& ten
   PRED_CHECK(tensor.scalar_type() == dtype, op, ": ", name, " must have the dtype of the other arguments");
 }
 
-inline void check_sizes(const char* op, const char* name, const Tensor& tensor, const std::vector<int64_t>& sizes) {
-  for (size_t dim = 0; dim < sizes.size(); ++dim) {
-    PRED_CHECK(tensor.size(int64_t(dim)) == sizes[dim], op, ": size ", dim, " of ", name, " must be ", sizes[dim],
-               ", got shape ", shape_text(tensor));
-  }
+inline void check_sizes(const char* op, const char* name, const Tensor& tensor, const std::vector<int64_t>& shape) {
+  PRED_CHECK(sizes(tensor) == shape, op, ": ", name, " must have shape ", shape_text(shape), ", got ",
+             shape_text(tensor));
 }
 
 // The sharpness of a sigmoid.

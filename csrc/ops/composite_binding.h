@@ -97,7 +97,14 @@ struct CompositeInputs {
     if (!values) return;
     check_cpu_tensor(op, "values", *values, int64_t(samples.size()) + 1, values_dtype);
     args.channels = values->size(values->dim() - 1);
+    check_channels("values");
     args.values = pointer<S>("values", values, with(samples, args.channels));
+  }
+
+  // More channels than that have tensors without rows only; the sizes of scratch rows need no further check.
+  void check_channels(const char* name) const {
+    PRED_CHECK(args.channels < int64_t(1) << 31, op, ": ", name, " must have fewer than 2^31 channels, got ",
+               args.channels);
   }
 
   // Of a contiguous copy, if need be.
@@ -179,11 +186,13 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_backward(
   if (grads.values && !in.has_values) {  // values are needed for the gradient of the source only
     check_cpu_tensor(in.op, "grad_values", *grads.values, 2, in.values_dtype);
     in.args.channels = grads.values->size(1);
+    in.check_channels("grad_values");
   }
-  PRED_CHECK(in.has_values || !grads.values || !(need.source || need.inv_s), in.op, ": values are missing");
-  PRED_CHECK(in.has_t || !grads.depth, in.op, ": t is missing");
-  PRED_CHECK(!need.t || grads.depth, in.op, ": need_t asks for grad_depth");
-  PRED_CHECK(!need.values || grads.values, in.op, ": need_values asks for grad_values");
+  PRED_CHECK(in.has_values || !grads.values || !(need.source || need.inv_s), in.op,
+             ": values must be given with grad_values");
+  PRED_CHECK(in.has_t || !grads.depth, in.op, ": t must be given with grad_depth");
+  PRED_CHECK(!need.t || grads.depth, in.op, ": grad_depth must be given with need_t");
+  PRED_CHECK(!need.values || grads.values, in.op, ": grad_values must be given with need_values");
   const CompositeCotangents<S> grad{in.template pointer<T>("grad_weights", grads.weights, in.samples),
                                     in.template pointer<T>("grad_depth", grads.depth, {in.num_rays}),
                                     in.template pointer<T>("grad_opacity", grads.opacity, {in.num_rays}),

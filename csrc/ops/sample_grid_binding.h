@@ -188,12 +188,6 @@ struct SampleGrid {
  private:
   static Tensor no_tensor(const Tensor& like) { return torch::stable::new_empty(like, {0}); }
 
-  static std::vector<int64_t> sizes(const Tensor& tensor) {
-    std::vector<int64_t> found;
-    for (int64_t dim = 0; dim < tensor.dim(); ++dim) found.push_back(tensor.size(dim));
-    return found;
-  }
-
   // A [B, C, (D,) H, W] tensor whose memory is [B, (D,) H, W, C].
   static Tensor new_channels_last(const Tensor& like) {
     std::vector<int64_t> memory_sizes = sizes(like);

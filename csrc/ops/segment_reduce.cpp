@@ -29,29 +29,27 @@ SegmentReduction reduction(const char* op, const std::string& name) {
 int64_t row_grain(int64_t channels) { return 1 + 16384 / (channels + 4); }
 
 // `index` lies in [-1, num_segments); the message names the first row for which it does not.
-template <typename S>
-void check_index(const Tensor& index, int64_t num_segments) {
+void check_index(const char* op, const Tensor& index, int64_t num_segments) {
   const int64_t* data = index.const_data_ptr<int64_t>();
-  const auto& k = kernels<S>();
+  const auto& k = kernels<float>();
   std::atomic<bool> valid{true};
   parallel(index.size(0), 32768, [&](int64_t begin, int64_t end) {
     if (!k.is_valid(data, num_segments, begin, end)) valid = false;
   });
   for (int64_t row = 0; !valid; ++row) {
-    PRED_CHECK(data[row] >= -1 && data[row] < num_segments,
-               "segment_reduce: index must lie in [-1, num_segments=", num_segments, "), got ", data[row], " in row ",
-               row);
+    PRED_CHECK(data[row] >= -1 && data[row] < num_segments, op, ": index must lie in [-1, num_segments=", num_segments,
+               "), got ", data[row], " in row ", row);
   }
 }
 
 template <typename S>
-std::tuple<Tensor, Tensor> forward(const Tensor& features_in, const Tensor& index_in, int64_t num_segments,
-                                   SegmentReduction how) {
+std::tuple<Tensor, Tensor> forward(const char* op, const Tensor& features_in, const Tensor& index_in,
+                                   int64_t num_segments, SegmentReduction how) {
   using T = Compute<S>;
   const SegmentReduceKernels<S>& k = kernels<S>();
   const Tensor features = torch::stable::contiguous(features_in), index = torch::stable::contiguous(index_in);
   const int64_t num_rows = features.size(0), channels = features.size(1);
-  check_index<S>(index, num_segments);
+  check_index(op, index, num_segments);
 
   Tensor out = torch::stable::new_empty(features, {num_segments, channels});
   Tensor saved = how == SegmentReduction::kSum ? torch::stable::new_empty(index, {0}, ScalarType::Int)
@@ -86,7 +84,7 @@ std::tuple<Tensor, Tensor> segment_reduce(const Tensor& features, const Tensor& 
              features.size(0));
   const SegmentReduction how = reduction(op, reduce);
   return PRED_DISPATCH_STORAGE(op, features.scalar_type(),
-                               [&] { return forward<S>(features, index, num_segments, how); });
+                               [&] { return forward<S>(op, features, index, num_segments, how); });
 }
 
 Tensor segment_reduce_backward(const Tensor& grad_in, const Tensor& index_in, const Tensor& saved_in,
@@ -103,7 +101,7 @@ Tensor segment_reduce_backward(const Tensor& grad_in, const Tensor& index_in, co
   const Tensor grad = torch::stable::contiguous(grad_in), index = torch::stable::contiguous(index_in);
   const Tensor saved = torch::stable::contiguous(saved_in);
   return PRED_DISPATCH_STORAGE(op, grad.scalar_type(), [&] {
-    check_index<S>(index, num_segments);
+    check_index(op, index, num_segments);
     Tensor out = torch::stable::new_empty(grad, {num_rows, channels});
     const S* grad_data = storage<S>(grad);
     const int64_t* index_data = index.const_data_ptr<int64_t>();

@@ -75,6 +75,9 @@ Outputs fill_voxels(const VoxelizeInputs& in, const Tensor& points, const Sorted
                     const Tensor& point_to_slot, int64_t max_points, int64_t max_voxels) {
   const VoxelizeHardKernels<M, Item>& k = kernels<M, Item>();
   const int64_t num_points = in.num_points(), columns = points.size(1);
+  int64_t voxel_elements;
+  PRED_CHECK(!__builtin_mul_overflow(max_points, columns, &voxel_elements), "voxelize_hard: max_points times ", columns,
+             " columns must fit int64, got ", max_points);
   const VoxelizeHardArgs<M, Item> a{sorted.items.get(), sorted.count, in.bits, storage<M>(points), columns, max_points};
   int64_t* slot_of = point_to_slot.mutable_data_ptr<int64_t>();
 
@@ -104,7 +107,7 @@ Outputs fill_voxels(const VoxelizeInputs& in, const Tensor& points, const Sorted
   M* voxels_data = mutable_storage<M>(voxels);
   int64_t* coords_data = coords.mutable_data_ptr<int64_t>();
   int64_t* counts_data = counts.mutable_data_ptr<int64_t>();
-  parallel(num_voxels, 1 + 16384 / (1 + max_points * columns), [&](int64_t begin, int64_t end) {
+  parallel(num_voxels, 1 + 16384 / std::max<int64_t>(voxel_elements, 1), [&](int64_t begin, int64_t end) {
     k.write(a, run_of_voxel.get(), voxels_data, coords_data, counts_data, slot_of, begin, end);
   });
   return {voxels, coords, counts, point_to_slot};
@@ -147,7 +150,7 @@ Tensor voxelize_hard_backward(const Tensor& grad_in, const Tensor& point_to_slot
     Tensor out = torch::stable::new_empty(grad, {num_points, columns});
     M* data = mutable_storage<M>(out);
     const auto& k = kernels<M, uint64_t>();
-    parallel(num_points, 1 + 16384 / (columns + 1),
+    parallel(num_points, 1 + 16384 / std::max<int64_t>(columns, 1),
              [&](int64_t begin, int64_t end) { k.backward(storage<M>(grad), columns, slot_of, data, begin, end); });
     return out;
   });

@@ -54,6 +54,9 @@ struct VoxelizeInputs {
     PRED_CHECK(voxel_size.size() == 3 && point_range.size() == 6 && grid_size.size() == 3, op,
                ": voxel_size, point_range and grid_size must hold 3, 6 and 3 numbers, got ", voxel_size.size(), ", ",
                point_range.size(), " and ", grid_size.size());
+    for (const double size : voxel_size) {
+      PRED_CHECK(size > 0, op, ": voxel_size must be positive, got ", size);
+    }
     for (const int64_t cells : grid_size) {
       PRED_CHECK(cells >= 1 && cells <= int64_t(1) << 30, op, ": grid_size must lie in [1, 2^30], got ", cells);
     }

@@ -257,6 +257,9 @@ def test_direct_calls_are_checked(native: None) -> None:
             call(points, torch.tensor(wrong, dtype=torch.int64), size, point_range, [512, 512, 1])
     with pytest.raises(KERNEL_ERROR, match=r"voxelize: grid_size must lie in \[1, 2\^30\], got 0"):
         call(points, torch.tensor([0, 10]), size, point_range, [512, 0, 1])
+    for wrong_size in (0.0, -0.1, math.nan):
+        with pytest.raises(KERNEL_ERROR, match="voxelize: voxel_size must be positive, got"):
+            call(points, torch.tensor([0, 10]), [0.1, wrong_size, 8.0], point_range, [512, 512, 1])
     with pytest.raises(KERNEL_ERROR, match="must hold 3, 6 and 3 numbers, got 3, 6 and 2"):
         call(points, torch.tensor([0, 10]), size, point_range, [512, 512])
     with pytest.raises(KERNEL_ERROR, match=r"at most 2\^62 voxels"):
