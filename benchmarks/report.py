@@ -78,8 +78,9 @@ class Row:
 
 
 def compare(rows: Sequence[Row], ceilings: Mapping[int, Ceilings]) -> list[dict[str, Any]]:
-    """Ours against the fastest of each other kind, phase by phase, and against the targets."""
+    """Ours against the fastest of each other kind, fewer threads and the targets, phase by phase."""
     groups: dict[tuple[str, str, int], list[Row]] = {}
+    fewest: dict[tuple[str, str], Row] = {}  # ours with the fewest threads, which come first
     for row in rows:
         groups.setdefault((row.case, row.phase, row.threads), []).append(row)
     comparisons = []
@@ -93,6 +94,9 @@ def compare(rows: Sequence[Row], ceilings: Mapping[int, Ceilings]) -> list[dict[
         comparison: dict[str, Any] = {"op": group[0].op, "case": case, "phase": phase, "threads": threads}
         against = {kind: _speedup(ours, other) for kind, other in best.items() if ours and other}
         comparison["speedup"] = against
+        alone = fewest.setdefault((case, phase), ours) if ours else None
+        if ours and alone and alone is not ours:
+            comparison["scaling"] = {"threads": alone.threads, "ratio": _median(alone) / _median(ours)}
         rates = (ours.rates(ceilings) if ours else None) or {}
         reached = {kind: speedup["ratio"] for kind, speedup in against.items()}
         reached |= {
@@ -226,7 +230,7 @@ def comparison_table(
     others = {key_of(comparison): comparison for comparison in default_allocator}
     header = (
         *("case", "phase", "threads", "vs reference", "vs eager", "rounds", "vs compiled", "vs peer", "memory"),
-        *("default malloc: vs eager", "target"),
+        *("default malloc: vs eager", "scaling", "target"),
     )
     lines = []
     previous = ""
@@ -247,10 +251,11 @@ def comparison_table(
                 f"{_ratio(comparison, 'peer')} {peer['contender']}" if peer else "",
                 f"{memory['share']:.2f}x eager" if memory else "",
                 _ratio(others.get(key_of(comparison), {"speedup": {}}), "eager"),
+                _scaling(comparison),
                 "; ".join(_verdict(target) for target in comparison["targets"]),
             ]
         )
-    return Table(header, lines, right=(2, 3, 4, 5, 6, 7, 8, 9))
+    return Table(header, lines, right=(2, 3, 4, 5, 6, 7, 8, 9, 10))
 
 
 def ceiling_table(ceilings: Mapping[int, Ceilings]) -> Table:
@@ -270,6 +275,11 @@ def key_of(comparison: Mapping[str, Any]) -> tuple[str, str, int]:
 def _ratio(comparison: Mapping[str, Any], kind: str) -> str:
     speedup = comparison["speedup"].get(kind)
     return f"{speedup['ratio']:.2f}x" if speedup else ""
+
+
+def _scaling(comparison: Mapping[str, Any]) -> str:
+    scaling = comparison.get("scaling")
+    return f"{scaling['ratio']:.2f}x of {scaling['threads']}" if scaling else ""
 
 
 def _verdict(target: Mapping[str, Any]) -> str:

@@ -284,6 +284,16 @@ def test_comparison_is_with_the_fastest_eager_and_against_the_targets() -> None:
     assert "50k rays/s" in table and "40% copy" in table and "refused: no" in table
 
 
+def test_scaling_is_ours_against_fewer_threads() -> None:
+    alone = replace(row("ours", "ours", timing(0.038, 0.038, 0.038)), threads=1)
+    eager = replace(row("eager", "eager", timing(0.1, 0.1, 0.1)), threads=1)
+    rows = [alone, eager, row("ours", "ours", timing(0.02, 0.02, 0.02)), row("eager", "eager", timing(0.1, 0.1, 0.1))]
+    ceilings = {threads: Ceilings(threads, copy_bytes_per_s=1e6, matrix_flop_per_s=1e9) for threads in (1, 2)}
+    first, second = compare(rows, ceilings)
+    assert "scaling" not in first and second["scaling"] == {"threads": 1, "ratio": pytest.approx(1.9)}
+    assert "1.90x of 1" in comparison_table([first, second]).text()
+
+
 def test_table_is_aligned() -> None:
     assert Table(("a", "empty", "b"), [["long", "", "1"], ["x", "", "23"]], right=(2,)).text().splitlines() == [
         "a      b",

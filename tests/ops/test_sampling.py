@@ -527,9 +527,7 @@ def test_direct_calls_are_checked(native: None, sampler: Sampler) -> None:
         sampler.native()(volume, grid.float(), False, False)
     with pytest.raises(KERNEL_ERROR, match=f"{sampler.op}: grid must be float32 with a float32 or half"):
         sampler.native()(volume.half(), grid, False, False)
-    with pytest.raises(
-        KERNEL_ERROR, match=f"{sampler.op}_backward: grad must have shape \\[2, 23, .\\], got"
-    ):
+    with pytest.raises(KERNEL_ERROR, match=f"{sampler.op}_backward: grad must have shape \\[2, 23, .\\], got"):
         sampler.native("_backward")(
             torch.zeros(2, 22, volume.shape[1]).double(), volume, grid, False, False, True, True
         )
