@@ -108,7 +108,7 @@ def check(wheel: Path, torch: str, python: str) -> tuple[str, str]:
         if found is None:
             return "newest torch", "NOT CHECKED: the index has none that is newer than the wheel's"
         torch = found
-    print(f"torch {torch}: pip downloads it with its CUDA libraries, 2 to 4 GB; {environment} takes some 6 GB", flush=True)
+    print(f"torch {torch}: pip downloads 2 to 4 GB with its CUDA libraries; {environment} takes some 6 GB", flush=True)
     install = [str(binary), "-m", "pip", "--disable-pip-version-check", "-q", "install"]
     run([*install, f"torch=={torch}", "pytest", "numpy", "hypothesis"])
     run([*install, "--no-deps", str(wheel)])

@@ -24,9 +24,9 @@ class Neighbors(NamedTuple):
 
 
 def knn(
-    points: Tensor,  # [N, D]
+    points: Tensor,  # [N, C]
     batch_offsets: Tensor,  # [B + 1]
-    queries: Tensor,  # [M, D]
+    queries: Tensor,  # [M, C]
     query_offsets: Tensor,  # [B + 1]
     k: int,
 ) -> Neighbors:
@@ -36,10 +36,10 @@ def knn(
     points (float32 for half precision). The search is exact.
 
     Args:
-        points: ``[N, D]`` float32, float64, bfloat16 or float16, D >= 3; the first three columns are x, y, z. Frame b
+        points: ``[N, C]`` float32, float64, bfloat16 or float16, C >= 3; the first three columns are x, y, z. Frame b
             owns the rows from ``batch_offsets[b]`` up to ``batch_offsets[b + 1]``. Any strides.
         batch_offsets: ``[B + 1]`` int64, ascending from 0 to N; frames may be empty.
-        queries: ``[M, D]``, D >= 3, columns as those of the points, same dtype; may be the points themselves, each of
+        queries: ``[M, C]``, C >= 3, columns as those of the points, same dtype; may be the points themselves, each of
             which then is its own first neighbour unless an equal point comes before it.
         query_offsets: ``[B + 1]`` int64, ascending from 0 to M.
         k: neighbours per query.
@@ -63,9 +63,9 @@ def knn(
 
 
 def knn_reference(
-    points: Tensor,  # [N, D]
+    points: Tensor,  # [N, C]
     batch_offsets: Tensor,  # [B + 1]
-    queries: Tensor,  # [M, D]
+    queries: Tensor,  # [M, C]
     query_offsets: Tensor,  # [B + 1]
     k: int,
 ) -> Neighbors:
