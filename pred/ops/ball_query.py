@@ -56,7 +56,7 @@ def ball_query(
 
     Raises:
         ValueError: shape, device, offsets (values are checked for CPU tensors), ``radius`` not positive, negative
-            ``max_points``. TypeError: dtype.
+            ``max_points``, 2^31 or more points or queries (compiled). TypeError: dtype.
 
     Not differentiable: the outputs are integers. Equal bits for any thread count and instruction set.
     """

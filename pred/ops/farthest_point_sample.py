@@ -37,8 +37,8 @@ def farthest_point_sample(
         finite points has n samples; the others are -1. Points with a NaN or infinite coordinate are never picked.
 
     Raises:
-        ValueError: shape, device, offsets (values are checked for CPU tensors), negative ``num_samples`` or ``start``.
-        TypeError: dtype.
+        ValueError: shape, device, offsets (values are checked for CPU tensors), negative ``num_samples`` or ``start``,
+            2^31 or more points (compiled). TypeError: dtype.
 
     Distances are sums of three squared differences in the dtype of the points (float32 for half precision); two points
     may be infinitely far from each other. Not differentiable: the output is integer. Equal bits for any thread count

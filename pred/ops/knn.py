@@ -50,7 +50,8 @@ def knn(
         with a NaN or infinite coordinate, any point of a query with one, and two points so far apart that it overflows.
 
     Raises:
-        ValueError: shape, device, offsets (values are checked for CPU tensors), negative ``k``. TypeError: dtype.
+        ValueError: shape, device, offsets (values are checked for CPU tensors), negative ``k``, 2^31 or more points or
+            queries (compiled). TypeError: dtype.
 
     Not differentiable, the distances neither: compute them again from the indices. Equal bits for any thread count and
     instruction set.

@@ -52,8 +52,8 @@ def voxelize(
         M may be 0.
 
     Raises:
-        ValueError: shape, device, sizes or range, offsets (values are checked for CPU tensors), or B nz ny nx (each
-            edge rounded up to a power of two) above 2^62. TypeError: dtype.
+        ValueError: shape, device, sizes or range, offsets (values are checked for CPU tensors), 2^31 or more points
+            (compiled), or B nz ny nx (each edge rounded up to a power of two) above 2^62. TypeError: dtype.
 
     Not differentiable: the outputs are integers. Equal bits for any thread count and instruction set.
     """

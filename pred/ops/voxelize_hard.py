@@ -58,7 +58,8 @@ def voxelize_hard(
 
     Raises:
         ValueError: shape, device, sizes or range, offsets (values are checked for CPU tensors), ``max_points`` or
-            ``max_voxels`` below 1, or B nz ny nx (each edge rounded up to a power of two) above 2^62.
+            ``max_voxels`` below 1, 2^31 or more points (compiled), or B nz ny nx (each edge rounded up to a power of
+            two) above 2^62.
         TypeError: dtype.
 
     ``voxels`` is differentiable in ``points`` any number of times: a kept point takes the gradient of its row, a
