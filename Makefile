@@ -18,8 +18,8 @@ VENV ?= .venv
 RUN ?= runs/demo
 MINUTES ?= 60
 SEED ?= 0
-# What wheel-check runs under: version of torch (or newest), colon, Python.
-WHEEL_PYTHON ?= $(or $(shell python3.12 -c "import sys; print(sys.executable)" 2>/dev/null),$(PYTHON))
+# What wheel-check runs under: version of torch (or newest), colon, Python. One that is missing is an error.
+WHEEL_PYTHON ?= python3.12
 WHEEL_CHECKS ?= 2.11.0:$(WHEEL_PYTHON) newest:$(WHEEL_PYTHON)
 
 BIN := $(VENV)/bin

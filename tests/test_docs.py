@@ -18,6 +18,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 RUN = [*PAGES, ROOT / "README.md"]
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\]\(([^)#\s]*)#?([^)\s]*)\)")
 
 
 @pytest.fixture
@@ -40,14 +42,32 @@ def test_python_blocks_run(page: Path) -> None:
 
 
 def test_every_op_is_listed() -> None:
+    """In the order of ``pred.ops.__all__``, with a page that mentions it."""
     listed = re.findall(r"^\| `(\w+)` \|.*\]\((\w+\.md)\) \|$", (ROOT / "docs/ops/index.md").read_text(), re.MULTILINE)
-    missing = set(PUBLIC) - {op for op, _ in listed}
-    assert not missing
+    assert [op for op, _ in listed] == PUBLIC
     for op, page in listed:
-        if op in PUBLIC and (ROOT / "docs/ops" / page).exists():
-            assert op in (ROOT / "docs/ops" / page).read_text(), f"{page} does not mention {op}"
+        assert f"`{op}" in (ROOT / "docs/ops" / page).read_text(), f"{page} does not mention {op}"
 
 
-def test_every_page_is_in_the_navigation() -> None:
-    listed = re.findall(r"([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
-    assert {str(page.relative_to(ROOT / "docs")) for page in PAGES} <= set(listed)
+def test_the_navigation_names_every_page_once() -> None:
+    named = re.findall(r"([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    assert sorted(named) == sorted(str(page.relative_to(ROOT / "docs")) for page in PAGES)
+
+
+def anchors(page: Path) -> set[str]:
+    """Of the headings, as the site makes them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    headings = (re.sub(r"[^\w\s-]", "", line) for line in re.findall(r"^#+ (.*)$", text, re.MULTILINE))
+    return {re.sub(r"[-\s]+", "-", heading.strip().lower()) for heading in headings}
+
+
+@pytest.mark.parametrize("page", [*RUN, ROOT / "CONTRIBUTING.md"], ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    """Files, and headings in them. Pages of the site do not lead out of it."""
+    for target, anchor in LINK.findall(CODE.sub("", page.read_text())):
+        if "://" in target:
+            continue
+        file = (page.parent / target).resolve() if target else page
+        assert file.exists(), f"{target} is not there"
+        assert page not in PAGES or file in PAGES, f"{target} is no page of the site"
+        assert not anchor or anchor in anchors(file), f"{target} has no heading {anchor}"

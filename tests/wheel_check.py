@@ -4,20 +4,24 @@
 
     python tests/wheel_check.py 2.11.0:python3.12 newest:python3.12
 
-The wheel is built with the running Python and its torch. Each check is a torch version (or "newest") and a Python
-command; it gets a virtual environment of its own in build/wheel-check, which later runs use again. Only torch, pytest,
-numpy and hypothesis are installed there: the ops need nothing else.
+The wheel is built with the running Python and its torch. Each check is a torch version and a Python command; "newest"
+is the newest torch of the package index, if that is newer than the wheel's. Each gets a virtual environment in
+build/wheel-check, made anew and removed once its tests have passed. Only torch, pytest, numpy and hypothesis are
+installed there: the ops need nothing else.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -56,16 +60,58 @@ def build() -> Path:
     return wheel
 
 
-def check(wheel: Path, torch: str, python: str) -> str:
-    """Installs torch and the wheel, runs the tests; returns the versions."""
+def find_python(command: str) -> str:
+    """The path of a Python that runs, and can make environments; there is no second choice."""
+    code = "import sys, ensurepip, venv; print(sys.executable)"
+    try:
+        found = subprocess.run([command, "-c", code], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        sys.exit(
+            f"wheel_check: Python {command!r} does not run:\n{getattr(error, 'stderr', None) or error}\n"
+            "Name one that does: make wheel-check WHEEL_PYTHON=/path/to/python, or all checks:\n"
+            'make wheel-check WHEEL_CHECKS="2.11.0:/path/to/python newest:/path/to/python"'
+        )
+    return found.stdout.strip()
+
+
+def parse(text: str) -> tuple[str, str]:
+    """Torch version and path of the Python of one check."""
+    torch, _, python = text.partition(":")
+    if not (torch == "newest" or re.fullmatch(r"\d+(\.\d+)+", torch)) or not python:
+        sys.exit(f"wheel_check: a check must be TORCH:PYTHON, such as 2.11.0:python3.12, got {text!r} (WHEEL_CHECKS)")
+    return torch, find_python(python)
+
+
+def release(version: str) -> tuple[int, ...]:
+    """2.13.0+cpu as (2, 13, 0)."""
+    return tuple(int(number) for number in version.partition("+")[0].split("."))
+
+
+def newest_torch(python: Path, wheel: Path) -> str | None:
+    """The newest torch that the index has for this Python, if it is newer than the one the wheel was built with."""
+    built = json.loads(zipfile.ZipFile(wheel).read("pred/build_info.json"))["torch"]
+    command = [str(python), "-m", "pip", "--disable-pip-version-check", "index", "versions", "torch"]
+    answer = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    listed = re.search(r"^Available versions: (.*)$", answer, re.MULTILINE)
+    assert listed is not None, answer
+    newest = max(listed.group(1).split(", "), key=release)
+    return newest if release(newest) > release(built) else None
+
+
+def check(wheel: Path, torch: str, python: str) -> tuple[str, str]:
+    """Installs torch and the wheel, runs the tests; returns the versions and the result."""
     environment = FOLDER / f"torch-{torch}"
     binary = environment / "bin/python"
-    if not binary.exists():
-        print(f"torch {torch}: pip downloads it with its CUDA libraries, 2 to 4 GB; {environment} takes some 6 GB")
-        run([python, "-m", "venv", str(environment)])
+    run([python, "-m", "venv", "--clear", str(environment)])
+    if torch == "newest":
+        found = newest_torch(binary, wheel)
+        if found is None:
+            return "newest torch", "NOT CHECKED: the index has none that is newer than the wheel's"
+        torch = found
+    print(f"torch {torch}: pip downloads 2 to 4 GB with its CUDA libraries; {environment} takes some 6 GB", flush=True)
     install = [str(binary), "-m", "pip", "--disable-pip-version-check", "-q", "install"]
-    run([*install, *(["-U", "torch"] if torch == "newest" else [f"torch=={torch}"]), "pytest", "numpy", "hypothesis"])
-    run([*install, "--no-deps", "--force-reinstall", str(wheel)])
+    run([*install, f"torch=={torch}", "pytest", "numpy", "hypothesis"])
+    run([*install, "--no-deps", str(wheel)])
     with tempfile.TemporaryDirectory() as name:
         outside = Path(name)  # of the source tree, whose pred/ would be imported
         for part in COPIED:
@@ -78,7 +124,8 @@ def check(wheel: Path, torch: str, python: str) -> str:
         facts = subprocess.run([str(binary), "-c", FACTS], cwd=outside, capture_output=True, text=True, check=True)
         print(facts.stdout, end="", flush=True)
         run([str(binary), "-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", "pythonpath=.", "tests/ops"], outside)
-    return facts.stdout.strip()
+    shutil.rmtree(environment)
+    return facts.stdout.strip(), "passed"
 
 
 def main() -> int:
@@ -86,12 +133,13 @@ def main() -> int:
     parser.add_argument("checks", nargs="+", metavar="TORCH:PYTHON")
     parser.add_argument("--wheel", type=Path, help="a wheel that is there already")
     options = parser.parse_args()
+    checks = [parse(text) for text in options.checks]  # before the wheel is built
     wheel = options.wheel or build()
     results, failed = [], 0
-    for torch, _, python in (text.partition(":") for text in options.checks):
+    for torch, python in checks:
         started = time.monotonic()
         try:
-            facts, result = check(wheel, torch, python or sys.executable), "passed"
+            facts, result = check(wheel, torch, python)
         except subprocess.CalledProcessError as error:
             print(error.stderr or "", file=sys.stderr)
             facts, result, failed = f"torch {torch}", f"FAILED ({error})", failed + 1

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fused ops for rendering-based LiDAR pre-training.
 
-Dimensions: ``B`` batch, ``N`` points or samples, ``M`` voxels, ``R`` rays, ``S`` samples per ray, ``P`` samples of all
-packed rays, ``C`` channels, ``H`` and ``W`` rows and columns of a BEV map, ``D`` layers of a volume. Each op has a
-plain PyTorch reference of the same meaning in its own module, which is its fallback and its oracle;
-:mod:`pred.ops.reference` gathers them.
+Dimensions: ``B`` batch (maps, volumes, frames of points), ``N`` points, rows, or samples of a map, ``M`` voxels or
+queries, ``R`` rays, ``S`` samples per ray, ``P`` samples of all packed rays, ``C`` channels of a map or columns of a
+row, ``D``, ``H`` and ``W`` layers, rows and columns of a map or volume. Other sizes have the name of the argument that
+sets them. Each op has a plain PyTorch reference of the same meaning in its own module, which is its fallback and its
+oracle; :mod:`pred.ops.reference` gathers them.
 """
 
 from pred.ops._composite import Composite
@@ -24,26 +25,26 @@ from pred.ops.segment_reduce import segment_reduce
 from pred.ops.voxelize import Voxels, voxelize
 from pred.ops.voxelize_hard import HardVoxels, voxelize_hard
 
-__all__ = [
-    "Ball",
-    "Composite",
-    "HardVoxels",
-    "Neighbors",
-    "Voxels",
-    "ball_query",
-    "SampledWithGrad",
-    "composite_alpha",
-    "composite_rays",
-    "farthest_point_sample",
-    "knn",
-    "resample_rays",
+__all__ = [  # in the order of docs/ops
     "sample_bev",
     "sample_bev_with_grad",
-    "sample_pdf",
     "sample_volume",
     "sample_volume_with_grad",
     "sdf_to_alpha",
-    "segment_reduce",
+    "composite_rays",
+    "composite_alpha",
+    "sample_pdf",
+    "resample_rays",
     "voxelize",
     "voxelize_hard",
+    "segment_reduce",
+    "farthest_point_sample",
+    "knn",
+    "ball_query",
+    "SampledWithGrad",
+    "Composite",
+    "Voxels",
+    "HardVoxels",
+    "Neighbors",
+    "Ball",
 ]

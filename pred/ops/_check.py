@@ -28,7 +28,9 @@ def check_shape(op: str, name: str, tensor: Tensor, shape: Sequence[int | str], 
     )
     if not fits:
         wanted = ", ".join(str(size) for size in shape)
-        raise ValueError(f"{op}: {name} must have shape [{wanted}]{where}, got {list(sizes)}")
+        single = len(sizes) == len(shape) - 1 and shape[0] in ("B", "R")
+        hint = f"; if there is only one: {name}.unsqueeze(0)" if single else ""
+        raise ValueError(f"{op}: {name} must have shape [{wanted}]{where}, got {list(sizes)}{hint}")
 
 
 def check_dtype(op: str, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype]) -> None:
@@ -51,8 +53,13 @@ def widen(tensor: Tensor) -> Tensor:
     return tensor.float() if tensor.dtype in HALF and torch.is_autocast_enabled(tensor.device.type) else tensor
 
 
-def as_geometry(tensor: Tensor) -> Tensor:
-    """In float32 if it is narrower: positions, distances and weights are too coarse in half precision."""
+def as_geometry(tensor: Tensor, dims: int | None = None) -> Tensor:
+    """In float32 if it is narrower: positions, distances and weights are too coarse in half precision.
+
+    With ``dims``, a last dimension of 1 beyond them is dropped: ``[R, S, 1]`` becomes ``[R, S]``.
+    """
+    if dims is not None and tensor.dim() == dims + 1 and tensor.shape[-1] == 1:
+        tensor = tensor[..., 0]
     return tensor.float() if tensor.dtype in HALF else tensor
 
 

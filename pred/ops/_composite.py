@@ -34,14 +34,6 @@ class Composite(NamedTuple):
     values: Tensor | None  # [R, C]; None without `values`
 
 
-def geometry(tensor: Tensor, packed: bool) -> Tensor:
-    """Distances, opacities and ranges: a last dimension of 1 is dropped, half precision becomes float32."""
-    dims = 1 if packed else 2
-    if tensor.dim() == dims + 1 and tensor.shape[-1] == 1:
-        tensor = tensor[..., 0]
-    return as_geometry(tensor)
-
-
 def check_options(op: str, depth_at: str, normalize_depth: bool, normalize_eps: float) -> None:
     """What both composites are told about the depth."""
     check_choice(op, "depth_at", depth_at, ("start", "mid"))
@@ -61,13 +53,14 @@ def composite_arguments(
     packed = ray_offsets is not None
     optional = {"t": t, "values": values, "ray_offsets": ray_offsets}
     check_tensors(op, **{name: source}, **{key: value for key, value in optional.items() if value is not None})
-    source = geometry(source, packed)
+    dims = 1 if packed else 2
+    source = as_geometry(source, dims)
     check_shape(op, name, source, ("P",) if packed else ("R", "S"))
     check_dtype(op, name, source, FLOATING)
     if ray_offsets is not None:
         check_offsets(op, "ray_offsets", ray_offsets, "RP", name, source)
     if t is not None:
-        t = geometry(t, packed)
+        t = as_geometry(t, dims)
         check_shape(op, "t", t, source.shape, f" as {name}")  # without its sizes: a compiled graph would depend on them
         check_like(op, "t", t, name, source)
     if values is not None:

@@ -24,9 +24,9 @@ class Ball(NamedTuple):
 
 
 def ball_query(
-    points: Tensor,  # [N, D]
+    points: Tensor,  # [N, C]
     batch_offsets: Tensor,  # [B + 1]
-    queries: Tensor,  # [M, D]
+    queries: Tensor,  # [M, C]
     query_offsets: Tensor,  # [B + 1]
     radius: float,
     max_points: int,
@@ -41,10 +41,10 @@ def ball_query(
     ``torch.where(indices < 0, indices[:, :1], indices).clamp_min(0)``.
 
     Args:
-        points: ``[N, D]`` float32, float64, bfloat16 or float16, D >= 3; the first three columns are x, y, z. Frame b
+        points: ``[N, C]`` float32, float64, bfloat16 or float16, C >= 3; the first three columns are x, y, z. Frame b
             owns the rows from ``batch_offsets[b]`` up to ``batch_offsets[b + 1]``. Any strides.
         batch_offsets: ``[B + 1]`` int64, ascending from 0 to N; frames may be empty.
-        queries: ``[M, D]``, D >= 3, columns as those of the points, same dtype.
+        queries: ``[M, C]``, C >= 3, columns as those of the points, same dtype.
         query_offsets: ``[B + 1]`` int64, ascending from 0 to M.
         radius: in the unit of the points, positive.
         max_points: length of each list.
@@ -56,7 +56,7 @@ def ball_query(
 
     Raises:
         ValueError: shape, device, offsets (values are checked for CPU tensors), ``radius`` not positive, negative
-            ``max_points``. TypeError: dtype.
+            ``max_points``, 2^31 or more points or queries (compiled). TypeError: dtype.
 
     Not differentiable: the outputs are integers. Equal bits for any thread count and instruction set.
     """
@@ -68,9 +68,9 @@ def ball_query(
 
 
 def ball_query_reference(
-    points: Tensor,  # [N, D]
+    points: Tensor,  # [N, C]
     batch_offsets: Tensor,  # [B + 1]
-    queries: Tensor,  # [M, D]
+    queries: Tensor,  # [M, C]
     query_offsets: Tensor,  # [B + 1]
     radius: float,
     max_points: int,

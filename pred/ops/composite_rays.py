@@ -29,7 +29,7 @@ def composite_rays(
     detach_inv_s: bool = True,
     normalize_eps: float = 1e-10,
 ) -> Composite:
-    """Renders depth and channels from signed distances along rays (PRED, Eq. 4).
+    """Renders depth and channels from signed distances along rays (PRED, Eq. 4 and 6).
 
     ``w_i = alpha_i prod_{j<i} (1 - alpha_j)`` with the opacities of :func:`pred.ops.sdf_to_alpha`;
     ``depth = sum_i w_i t_i``, ``opacity = sum_i w_i``, ``values = sum_i w_i values_i``. Weight i belongs to the section

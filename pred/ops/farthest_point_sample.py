@@ -13,7 +13,7 @@ from pred.ops._clouds import frame_slices, positions, squared_distances
 
 
 def farthest_point_sample(
-    points: Tensor,  # [N, D]
+    points: Tensor,  # [N, C]
     batch_offsets: Tensor,  # [B + 1]
     num_samples: int,
     start: int = 0,
@@ -25,7 +25,7 @@ def farthest_point_sample(
     every point then lies on a sample, and all are equally far.
 
     Args:
-        points: ``[N, D]`` float32, float64, bfloat16 or float16, D >= 3; the first three columns are x, y, z. Frame b
+        points: ``[N, C]`` float32, float64, bfloat16 or float16, C >= 3; the first three columns are x, y, z. Frame b
             owns the rows from ``batch_offsets[b]`` up to ``batch_offsets[b + 1]``. Any strides.
         batch_offsets: ``[B + 1]`` int64, ascending from 0 to N; frames may be empty.
         num_samples: samples per frame.
@@ -37,8 +37,8 @@ def farthest_point_sample(
         finite points has n samples; the others are -1. Points with a NaN or infinite coordinate are never picked.
 
     Raises:
-        ValueError: shape, device, offsets (values are checked for CPU tensors), negative ``num_samples`` or ``start``.
-        TypeError: dtype.
+        ValueError: shape, device, offsets (values are checked for CPU tensors), negative ``num_samples`` or ``start``,
+            2^31 or more points (compiled). TypeError: dtype.
 
     Distances are sums of three squared differences in the dtype of the points (float32 for half precision); two points
     may be infinitely far from each other. Not differentiable: the output is integer. Equal bits for any thread count
@@ -53,7 +53,7 @@ def farthest_point_sample(
 
 
 def farthest_point_sample_reference(
-    points: Tensor,  # [N, D]
+    points: Tensor,  # [N, C]
     batch_offsets: Tensor,  # [B + 1]
     num_samples: int,
     start: int = 0,

@@ -24,9 +24,9 @@ class Neighbors(NamedTuple):
 
 
 def knn(
-    points: Tensor,  # [N, D]
+    points: Tensor,  # [N, C]
     batch_offsets: Tensor,  # [B + 1]
-    queries: Tensor,  # [M, D]
+    queries: Tensor,  # [M, C]
     query_offsets: Tensor,  # [B + 1]
     k: int,
 ) -> Neighbors:
@@ -36,10 +36,10 @@ def knn(
     points (float32 for half precision). The search is exact.
 
     Args:
-        points: ``[N, D]`` float32, float64, bfloat16 or float16, D >= 3; the first three columns are x, y, z. Frame b
+        points: ``[N, C]`` float32, float64, bfloat16 or float16, C >= 3; the first three columns are x, y, z. Frame b
             owns the rows from ``batch_offsets[b]`` up to ``batch_offsets[b + 1]``. Any strides.
         batch_offsets: ``[B + 1]`` int64, ascending from 0 to N; frames may be empty.
-        queries: ``[M, D]``, D >= 3, columns as those of the points, same dtype; may be the points themselves, each of
+        queries: ``[M, C]``, C >= 3, columns as those of the points, same dtype; may be the points themselves, each of
             which then is its own first neighbour unless an equal point comes before it.
         query_offsets: ``[B + 1]`` int64, ascending from 0 to M.
         k: neighbours per query.
@@ -50,7 +50,8 @@ def knn(
         with a NaN or infinite coordinate, any point of a query with one, and two points so far apart that it overflows.
 
     Raises:
-        ValueError: shape, device, offsets (values are checked for CPU tensors), negative ``k``. TypeError: dtype.
+        ValueError: shape, device, offsets (values are checked for CPU tensors), negative ``k``, 2^31 or more points or
+            queries (compiled). TypeError: dtype.
 
     Not differentiable, the distances neither: compute them again from the indices. Equal bits for any thread count and
     instruction set.
@@ -63,9 +64,9 @@ def knn(
 
 
 def knn_reference(
-    points: Tensor,  # [N, D]
+    points: Tensor,  # [N, C]
     batch_offsets: Tensor,  # [B + 1]
-    queries: Tensor,  # [M, D]
+    queries: Tensor,  # [M, C]
     query_offsets: Tensor,  # [B + 1]
     k: int,
 ) -> Neighbors:

@@ -18,20 +18,20 @@ from pred.ops.segment_reduce import segment_reduce_reference as segment_reduce
 from pred.ops.voxelize import voxelize_reference as voxelize
 from pred.ops.voxelize_hard import voxelize_hard_reference as voxelize_hard
 
-__all__ = [
-    "ball_query",
-    "composite_alpha",
-    "composite_rays",
-    "farthest_point_sample",
-    "knn",
-    "resample_rays",
+__all__ = [  # in the order of docs/ops
     "sample_bev",
     "sample_bev_with_grad",
-    "sample_pdf",
     "sample_volume",
     "sample_volume_with_grad",
     "sdf_to_alpha",
-    "segment_reduce",
+    "composite_rays",
+    "composite_alpha",
+    "sample_pdf",
+    "resample_rays",
     "voxelize",
     "voxelize_hard",
+    "segment_reduce",
+    "farthest_point_sample",
+    "knn",
+    "ball_query",
 ]

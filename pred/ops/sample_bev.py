@@ -35,7 +35,8 @@ def sample_bev(
         but its own. Empty for ``B = 0`` or ``N = 0``.
 
     Raises:
-        ValueError: shape, device or ``padding_mode``. TypeError: dtype.
+        ValueError: shape, device or ``padding_mode``; in the backward pass of a map, 2^31 or more samples B N
+            (compiled). TypeError: dtype.
 
     Differentiable twice in ``bev`` and ``grid`` (a third derivative raises). Where the value has a kink, on the
     lines through cell centres, the derivative is the one towards larger coordinates; at the outermost centres with

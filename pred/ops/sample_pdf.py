@@ -164,9 +164,7 @@ def pdf_arguments(
         check_number(op, option, value)
         if not 0 <= value < math.inf:
             raise ValueError(f"{op}: {option} must be finite and not negative, got {value}")
-    edges, weights = (
-        as_geometry(x.detach()[..., 0] if x.dim() == 3 and x.shape[2] == 1 else x.detach()) for x in (edges, weights)
-    )
+    edges, weights = as_geometry(edges.detach(), 2), as_geometry(weights.detach(), 2)
     check_shape(op, name, edges, ("R", "S"))
     check_dtype(op, name, edges, FLOATING)
     rays, samples = edges.shape

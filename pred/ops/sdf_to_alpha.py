@@ -54,9 +54,9 @@ def sdf_to_alpha(
 
     Args:
         sdf: signed distances along each ray in metres, positive in front of the surface; ``[R, S]`` or ``[R, S, 1]``,
-            or ``[P]``: packed rays in mode pair, any samples in the other modes. In mode section, the distance at the
-            middle of the section (NeuS) or at its start (UniPAD); in mode density, the density per metre. float32 or
-            float64; half precision is widened to float32.
+            or ``[P]``: packed rays (also ``[P, 1]``) in mode pair, any samples in the other modes. In mode section, the
+            distance at the middle of the section (NeuS) or at its start (UniPAD); in mode density, the density per
+            metre. float32 or float64; half precision is widened to float32.
         inv_s: sharpness per metre, finite and not negative: a number, or a tensor of one element on the device of
             ``sdf``. None in mode density.
         mode: ``"pair"``, ``"section"`` or ``"density"``.
@@ -70,9 +70,9 @@ def sdf_to_alpha(
             int64, ascending from 0 to P.
 
     Returns:
-        ``[R, S]`` (also for ``[R, S, 1]``) or ``[P]``. In [0, 1]; exactly 0 where the distance does not fall (except
-        with ``eps > 0``). A negative density gives a negative opacity, as its formula does. A NaN stays in its ray,
-        in modes section and density in its sample.
+        ``[R, S]`` (also for ``[R, S, 1]``) or ``[P]`` (also for packed ``[P, 1]``). In [0, 1]; exactly 0 where the
+        distance does not fall (except with ``eps > 0``). A negative density gives a negative opacity, as its formula
+        does. A NaN stays in its ray, in modes section and density in its sample.
 
     Raises:
         ValueError: shape, device, range, an unknown choice, an argument that the mode does not have, or the value of
@@ -187,23 +187,18 @@ def _check_mode(
         raise ValueError(f"{op}: eps must be finite and not negative, got {eps}")
 
 
-def _flat(tensor: Tensor) -> Tensor:
-    """Without the last dimension of ``[R, S, 1]``, in float32 at least."""
-    return as_geometry(tensor[..., 0] if tensor.dim() == 3 and tensor.shape[2] == 1 else tensor)
-
-
 def _elementwise(sdf: Tensor, **others: Tensor | None) -> list[Tensor]:
     """``sdf``, or the densities, ``[R, S]`` or ``[P]``, and other tensors of its shape."""
     op = "sdf_to_alpha"
     check_tensors(op, sdf=sdf, **others)
-    sdf = _flat(sdf)
+    sdf = as_geometry(sdf, 2)
     if sdf.dim() not in (1, 2):
         raise ValueError(f"{op}: sdf must have shape [R, S], [R, S, 1] or [P], got {list(sdf.shape)}")
     check_dtype(op, "sdf", sdf, FLOATING)
     tensors = [sdf]
     for name, other in others.items():
         assert other is not None  # by _check_mode
-        tensors.append(_flat(other))
+        tensors.append(as_geometry(other, 2))
         check_shape(op, name, tensors[-1], sdf.shape, " as sdf")
         check_like(op, name, tensors[-1], "sdf", sdf)
     return tensors
@@ -219,7 +214,7 @@ def _section(
 def _pair(sdf: Tensor, inv_s: Tensor | float, ray_offsets: Tensor | None) -> tuple[Tensor, Tensor]:
     op = "sdf_to_alpha"
     check_tensors(op, sdf=sdf, **({} if ray_offsets is None else {"ray_offsets": ray_offsets}))
-    sdf = _flat(sdf)
+    sdf = as_geometry(sdf, 2 if ray_offsets is None else 1)
     check_shape(op, "sdf", sdf, ("R", "S") if ray_offsets is None else ("P",))
     check_dtype(op, "sdf", sdf, FLOATING)
     if ray_offsets is not None:

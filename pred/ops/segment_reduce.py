@@ -32,8 +32,8 @@ def segment_reduce(
         segment and channel NaN, in ``"max"`` too (as ``torch.amax``).
 
     Raises:
-        ValueError: shape, device, ``reduce``, or an index outside [-1, num_segments) (checked for CPU tensors, before
-            anything is written). TypeError: dtype.
+        ValueError: shape, device, ``reduce``, 2^31 or more rows (compiled), or an index outside [-1, num_segments)
+            (checked for CPU tensors, before anything is written). TypeError: dtype.
 
     Differentiable any number of times in ``features``. Of equal maxima the first row takes the gradient; with NaN
     present it is the first NaN. Deterministic for any thread count: rows are added in their order.

@@ -27,7 +27,7 @@ class Voxels(NamedTuple):
 
 
 def voxelize(
-    points: Tensor,  # [N, D]
+    points: Tensor,  # [N, C]
     batch_offsets: Tensor,  # [B + 1]
     voxel_size: Sequence[float],  # (x, y, z)
     point_range: Sequence[float],  # (x_min, y_min, z_min, x_max, y_max, z_max)
@@ -40,7 +40,7 @@ def voxelize(
     coordinates are outside.
 
     Args:
-        points: ``[N, D]`` float32, float64, bfloat16 or float16, D >= 3; the first three columns are x, y, z. Frame b
+        points: ``[N, C]`` float32, float64, bfloat16 or float16, C >= 3; the first three columns are x, y, z. Frame b
             owns the rows from ``batch_offsets[b]`` up to ``batch_offsets[b + 1]``. Any strides.
         batch_offsets: ``[B + 1]`` int64, ascending from 0 to N; frames may be empty.
         voxel_size: edge lengths (x, y, z), in the unit of the points.
@@ -52,8 +52,8 @@ def voxelize(
         M may be 0.
 
     Raises:
-        ValueError: shape, device, sizes or range, offsets (values are checked for CPU tensors), or B nz ny nx (each
-            edge rounded up to a power of two) above 2^62. TypeError: dtype.
+        ValueError: shape, device, sizes or range, offsets (values are checked for CPU tensors), 2^31 or more points
+            (compiled), or B nz ny nx (each edge rounded up to a power of two) above 2^62. TypeError: dtype.
 
     Not differentiable: the outputs are integers. Equal bits for any thread count and instruction set.
     """
@@ -65,7 +65,7 @@ def voxelize(
 
 
 def voxelize_reference(
-    points: Tensor,  # [N, D]
+    points: Tensor,  # [N, C]
     batch_offsets: Tensor,  # [B + 1]
     voxel_size: Sequence[float],
     point_range: Sequence[float],

@@ -18,13 +18,13 @@ from pred.ops.voxelize import check_voxelize_arguments, voxelize_reference
 class HardVoxels(NamedTuple):
     """Voxels of a batch: frame after frame, within a frame in the order in which their first points appear."""
 
-    voxels: Tensor  # [M, P, D], dtype of the points
+    voxels: Tensor  # [M, max_points, C], dtype of the points
     coords: Tensor  # [M, 4] int64, (b, z, y, x)
     counts: Tensor  # [M] int64, points kept per voxel
 
 
 def voxelize_hard(
-    points: Tensor,  # [N, D]
+    points: Tensor,  # [N, C]
     batch_offsets: Tensor,  # [B + 1]
     voxel_size: Sequence[float],  # (x, y, z)
     point_range: Sequence[float],  # (x_min, y_min, z_min, x_max, y_max, z_max)
@@ -43,22 +43,23 @@ def voxelize_hard(
     the bound whose quotient rounds down, which here is outside). spconv's coordinates are int32 (z, y, x).
 
     Args:
-        points: ``[N, D]`` float32, float64, bfloat16 or float16, D >= 3; the first three columns are x, y, z. Frame b
+        points: ``[N, C]`` float32, float64, bfloat16 or float16, C >= 3; the first three columns are x, y, z. Frame b
             owns the rows from ``batch_offsets[b]`` up to ``batch_offsets[b + 1]``. Any strides.
         batch_offsets: ``[B + 1]`` int64, ascending from 0 to N; frames may be empty.
         voxel_size: edge lengths (x, y, z), in the unit of the points.
         point_range: (x_min, y_min, z_min, x_max, y_max, z_max), same unit and frame as the points; each edge a whole
             multiple of the voxel size (within 1e-3 of a voxel).
-        max_points: P, rows per voxel.
+        max_points: rows per voxel.
         max_voxels: voxels per frame.
 
     Returns:
-        ``voxels [M, P, D]`` in the dtype of the points, ``coords [M, 4]`` (b, z, y, x) and ``counts [M]``, the number
-        of points kept, both int64. M may be 0.
+        ``voxels [M, max_points, C]`` in the dtype of the points, ``coords [M, 4]`` (b, z, y, x) and ``counts [M]``, the
+        number of points kept, both int64. M may be 0.
 
     Raises:
         ValueError: shape, device, sizes or range, offsets (values are checked for CPU tensors), ``max_points`` or
-            ``max_voxels`` below 1, or B nz ny nx (each edge rounded up to a power of two) above 2^62.
+            ``max_voxels`` below 1, 2^31 or more points (compiled), or B nz ny nx (each edge rounded up to a power of
+            two) above 2^62.
         TypeError: dtype.
 
     ``voxels`` is differentiable in ``points`` any number of times: a kept point takes the gradient of its row, a
@@ -77,7 +78,7 @@ def voxelize_hard(
 
 
 def voxelize_hard_reference(
-    points: Tensor,  # [N, D]
+    points: Tensor,  # [N, C]
     batch_offsets: Tensor,  # [B + 1]
     voxel_size: Sequence[float],
     point_range: Sequence[float],
