@@ -166,6 +166,8 @@ def test_any_number_of_empty_rays(native: None) -> None:
 
 
 def test_sizes_whose_products_overflow_are_refused(native: None) -> None:
+    with pytest.raises(KERNEL_ERROR, match=r"composite_alpha: alpha must have fewer than 2\^40 rays, got 2305843"):
+        torch.ops.pred.composite_alpha(torch.empty(2**61, 0), None, None, None, 0.0, False)
     with pytest.raises(KERNEL_ERROR, match=r"composite_alpha: values must have fewer than 2\^31 channels, got 2305843"):
         values = torch.empty(3, 0, 2**61)
         torch.ops.pred.composite_alpha(torch.zeros(3, 0), None, values, None, 0.0, False)
