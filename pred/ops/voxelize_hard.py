@@ -65,11 +65,11 @@ def voxelize_hard(
     dropped one 0. Equal bits for any thread count and instruction set.
     """
     _native.refuse_transforms("voxelize_hard")
-    points, *edges = _arguments(points, batch_offsets, voxel_size, point_range, max_points, max_voxels)
+    points, cells = _arguments(points, batch_offsets, voxel_size, point_range, max_points, max_voxels)
     if _native.use_native("voxelize_hard", points):
-        out = torch.ops.pred.voxelize_hard(points, batch_offsets, *edges, max_points, max_voxels)
+        out = torch.ops.pred.voxelize_hard(points, batch_offsets, *cells, max_points, max_voxels)
         return HardVoxels(*out[:3])
-    return _gather(points, number_voxels(points, batch_offsets, *edges), batch_offsets, max_points, max_voxels)
+    return _gather(points, number_voxels(points, batch_offsets, *cells), batch_offsets, max_points, max_voxels)
 
 
 def voxelize_hard_reference(
@@ -81,8 +81,8 @@ def voxelize_hard_reference(
     max_voxels: int,
 ) -> HardVoxels:
     """Plain PyTorch form of :func:`voxelize_hard`: two sorts on top of :func:`pred.ops.reference.voxelize`."""
-    points, *edges = _arguments(points, batch_offsets, voxel_size, point_range, max_points, max_voxels)
-    return _gather(points, number_voxels(points, batch_offsets, *edges), batch_offsets, max_points, max_voxels)
+    points, cells = _arguments(points, batch_offsets, voxel_size, point_range, max_points, max_voxels)
+    return _gather(points, number_voxels(points, batch_offsets, *cells), batch_offsets, max_points, max_voxels)
 
 
 def _arguments(
@@ -92,15 +92,15 @@ def _arguments(
     point_range: Sequence[float],
     max_points: int,
     max_voxels: int,
-) -> tuple[Tensor, list[float], list[float], list[int]]:
-    """Points, voxel size, range and grid size (x, y, z) after all checks."""
+) -> tuple[Tensor, tuple[list[float], list[float], list[int]]]:
+    """Points, and voxel size, range and grid size (x, y, z), after all checks."""
     op = "voxelize_hard"
     check_tensors(op, points=points, batch_offsets=batch_offsets)
     points = widen(points)
-    edges = check_voxelize_arguments(op, points, batch_offsets, voxel_size, point_range)
+    cells = check_voxelize_arguments(op, points, batch_offsets, voxel_size, point_range)
     check_count(op, "max_points", max_points, least=1)
     check_count(op, "max_voxels", max_voxels, least=1)
-    return points, *edges
+    return points, cells
 
 
 def _gather(points: Tensor, found: Voxels, batch_offsets: Tensor, max_points: int, max_voxels: int) -> HardVoxels:
