@@ -8,10 +8,11 @@
 A call must give a result of the documented shape, or be refused; the compiled op and its reference must agree about
 which. Refusals are
 
-- ValueError or TypeError of the form ``op: argument must <rule>, got <fact>``;
+- ValueError or TypeError, of a public op in the form ``op: argument must <rule>, got <fact>``; a kernel that is called
+  past it protects memory, and may use other words;
 - RuntimeError of torch, for tensors that it does not compute with (of another layout, say), and of the dispatcher, for
   plain arguments whose types only it looks at;
-- MemoryError or OverflowError, where a size does not fit into memory or into int64.
+- MemoryError, OverflowError or the text of std::length_error, where a size does not fit into memory or into int64.
 
 All else is a finding: another exception or text, a shape that differs, a crash, a call that does not end. Calls run in
 child processes, so that a crash is caught and named. ``make fuzz`` runs this on the sanitized library.
@@ -50,8 +51,6 @@ SEEDS_PER_RUN = 10**9
 SECONDS_PER_CALL = 60
 EXTRA_MEMORY = 6 << 30
 ACCEPTED = (ValueError, TypeError, RuntimeError)
-TOO_LARGE = (MemoryError, OverflowError)
-"""Of std::bad_alloc, and of a whole number that int64 does not hold."""
 DTYPES = [
     torch.float32,
     torch.float64,
@@ -253,7 +252,7 @@ def attempt(function: Callable[[], Any]) -> tuple[Any, Exception | None]:
     """Result, or an exception of an accepted type."""
     try:
         return function(), None
-    except TOO_LARGE as error:
+    except (MemoryError, OverflowError) as error:
         return None, error
     except RecursionError as error:
         raise FindingError(f"endless recursion: {error}") from error
@@ -265,9 +264,14 @@ def attempt(function: Callable[[], Any]) -> tuple[Any, Exception | None]:
         raise FindingError(f"{type(error).__name__}: {error}\n{traceback.format_exc(limit=-4)}") from error
 
 
+def is_too_large(error: Exception | None) -> bool:
+    """std::bad_alloc, a whole number that int64 does not hold, or std::length_error, which arrives as a ValueError."""
+    return isinstance(error, (MemoryError, OverflowError)) or str(error).startswith("vector::")
+
+
 def is_ours(error: Exception) -> bool:
     """A ValueError or TypeError; torch's own are RuntimeErrors, or else a check of ours is missing."""
-    return isinstance(error, (ValueError, TypeError))
+    return isinstance(error, (ValueError, TypeError)) and not is_too_large(error)
 
 
 def require_form(op: str, who: str, error: Exception | None) -> None:
@@ -336,7 +340,7 @@ class Fuzzer:
             return "result" if error is None else type(error).__name__  # autograd refuses some of them
         require_form(example.op, "the compiled op", error)
         large = is_large(arguments.values())
-        if isinstance(error, TOO_LARGE) and not large:
+        if is_too_large(error) and not large:
             raise FindingError(f"nothing is large, and yet: {error!r}")
         if large:
             return "too large" if error is None else type(error).__name__
@@ -383,7 +387,7 @@ class Fuzzer:
         result, error = attempt(lambda: op(*values))
         if error is not None:
             large = is_large(item for value in values for item in (value if isinstance(value, list) else [value]))
-            if isinstance(error, TOO_LARGE) and not large:
+            if is_too_large(error) and not large:
                 raise FindingError(f"nothing is large, and yet: {error!r}")
             return type(error).__name__
         if name == "parallel_probe":
