@@ -570,7 +570,7 @@ def test_annealing_does_not_compile_again(native: None) -> None:
     for step in range(12):
         expected = ours(inputs[0], inputs[0].new_full((), 2.7), *inputs[1:], step / 20, 0.0)
         assert_close(compiled(*inputs, step / 20), expected, 1e-13)
-    assert counter.frame_count <= 3
+    assert counter.frame_count <= 2  # the first number, and all others
 
 
 def test_modes_are_bitwise_equal_for_any_thread_count(native: None) -> None:
