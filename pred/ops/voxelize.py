@@ -109,7 +109,7 @@ def check_voxelize_arguments(
     """Voxel size, range and grid size (x, y, z) after all checks."""
     check_tensors(op, points=points, batch_offsets=batch_offsets)
     if points.dim() != 2 or points.shape[1] < 3:
-        raise ValueError(f"{op}: points must have shape [N, D] with D >= 3, got {list(points.shape)}")
+        raise ValueError(f"{op}: points must have shape [N, C] with C >= 3, got {list(points.shape)}")
     check_dtype(op, "points", points, FLOATING + HALF)
     check_offsets(op, "batch_offsets", batch_offsets, "BN", "points", points)
     size, bounds = _floats(op, "voxel_size", voxel_size, 3), _floats(op, "point_range", point_range, 6)
