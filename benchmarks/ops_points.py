@@ -40,7 +40,7 @@ def _voxelize_cases(sizes: Sizes) -> list[Case]:
             phases=(
                 Phase(
                     FORWARD,
-                    "4 N D + 8 N + 40 M",
+                    "4 N C + 8 N + 40 M",
                     points.nbytes + 8 * sizes.points + 40 * len(voxels.counts),
                     (Target("eager", 5),),
                 ),
@@ -103,8 +103,8 @@ def _voxelize_hard_cases(sizes: Sizes) -> list[Case]:
             derivative_in=(0,),
             tolerance=0.0,
             phases=(
-                Phase(FORWARD, "4 N D + 4 M P D + 40 M", forward, (Target("peer", 2),)),
-                Phase(BACKWARD, "8 N D + 8 M P D + 40 M", forward + points.nbytes + voxels.nbytes),
+                Phase(FORWARD, "4 N C + 4 M max_points C + 40 M", forward, (Target("peer", 2),)),
+                Phase(BACKWARD, "8 N C + 8 M max_points C + 40 M", forward + points.nbytes + voxels.nbytes),
             ),
             peers=peers.voxelize_hard(columns, size, cases.POINT_RANGE_M, *limits),
         )

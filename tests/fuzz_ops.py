@@ -5,10 +5,17 @@
     python -m tests.fuzz_ops --minutes 60 --seed 0    looks for findings
     python -m tests.fuzz_ops --only 123456            repeats one call
 
-A call must give a result of the documented shape, or raise ValueError, TypeError or RuntimeError; the compiled op and
-its reference must agree about which. All else is a finding: another exception, a shape that differs, a crash, a call
-that does not end. Calls run in child processes, so that a crash is caught and named. ``make fuzz`` runs this on the
-sanitized library.
+A call must give a result of the documented shape, or be refused; the compiled op and its reference must agree about
+which. Refusals are
+
+- ValueError or TypeError, of a public op in the form ``op: argument must <rule>, got <fact>``; a kernel that is called
+  past it protects memory, and may use other words;
+- RuntimeError of torch, for tensors that it does not compute with (of another layout, say), and of the dispatcher, for
+  plain arguments whose types only it looks at;
+- MemoryError, OverflowError or the text of std::length_error, where a size does not fit into memory or into int64.
+
+All else is a finding: another exception or text, a shape that differs, a crash, a call that does not end. Calls run in
+child processes, so that a crash is caught and named. ``make fuzz`` runs this on the sanitized library.
 """
 
 from __future__ import annotations
@@ -19,6 +26,7 @@ import faulthandler
 import json
 import os
 import random
+import re
 import resource
 import signal
 import subprocess
@@ -28,7 +36,7 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import torch
@@ -241,10 +249,10 @@ def backend(name: str) -> Iterator[None]:
 
 
 def attempt(function: Callable[[], Any]) -> tuple[Any, Exception | None]:
-    """Result, or an accepted exception."""
+    """Result, or an exception of an accepted type."""
     try:
         return function(), None
-    except (MemoryError, OverflowError) as error:  # std::bad_alloc; a whole number that int64 does not hold
+    except (MemoryError, OverflowError) as error:
         return None, error
     except RecursionError as error:
         raise FindingError(f"endless recursion: {error}") from error
@@ -256,9 +264,34 @@ def attempt(function: Callable[[], Any]) -> tuple[Any, Exception | None]:
         raise FindingError(f"{type(error).__name__}: {error}\n{traceback.format_exc(limit=-4)}") from error
 
 
+def is_too_large(error: Exception | None) -> bool:
+    """std::bad_alloc, a whole number that int64 does not hold, or std::length_error, which arrives as a ValueError."""
+    return isinstance(error, (MemoryError, OverflowError)) or str(error).startswith("vector::")
+
+
+def is_ours(error: Exception) -> bool:
+    """A ValueError or TypeError; torch's own are RuntimeErrors, or else a check of ours is missing."""
+    return isinstance(error, (ValueError, TypeError)) and not is_too_large(error)
+
+
+def require_form(op: str, who: str, error: Exception | None) -> None:
+    if error is not None and is_ours(error) and not re.match(rf"{op}: \w+ must .*, got ", str(error), re.DOTALL):
+        raise FindingError(f"{who} does not say '{op}: argument must <rule>, got <fact>': {error!r}")
+
+
 def rule(error: Exception) -> str:
     """The op and the argument that is blamed; C++ prints fewer digits of the numbers that follow."""
     return str(error).partition(" must ")[0]
+
+
+def is_large(values: Iterable[Any]) -> bool:
+    """Whether a size among the arguments is too large for the reference, which holds more than its result."""
+    sizes = [
+        max((value.numel(), *value.shape)) if isinstance(value, Tensor) else abs(value)
+        for value in values
+        if isinstance(value, (Tensor, int))
+    ]
+    return max(sizes, default=0) > 1e6
 
 
 def shapes(result: dict[str, Tensor]) -> dict[str, Any]:
@@ -305,12 +338,17 @@ class Fuzzer:
             native, error = attempt(call)
         if any(x.is_inference() for x in tensors):
             return "result" if error is None else type(error).__name__  # autograd refuses some of them
-        if isinstance(error, MemoryError) or self.is_large(arguments):
+        require_form(example.op, "the compiled op", error)
+        large = is_large(arguments.values())
+        if is_too_large(error) and not large:
+            raise FindingError(f"nothing is large, and yet: {error!r}")
+        if large:
             return "too large" if error is None else type(error).__name__
         with backend("reference"):
             expected, expected_error = attempt(call)
+        require_form(example.op, "the reference", expected_error)
         if error is not None:
-            if str(error).startswith(f"{example.op}: ") and "no kernel for device" not in str(error):
+            if is_ours(error):
                 if type(expected_error) is not type(error) or rule(expected_error) != rule(error):
                     raise FindingError(f"the compiled op says: {error!r}\nthe reference says: {expected_error!r}")
             elif expected_error is None and all(x.device.type == "cpu" for x in tensors) and "pred::" not in str(error):
@@ -318,8 +356,8 @@ class Fuzzer:
                 raise FindingError(f"the reference accepts what the compiled op refuses: {error!r}")
             return type(error).__name__
         if expected_error is not None:
-            if not str(expected_error).startswith(f"{example.op}: "):
-                return "result"  # torch, on a tensor where a number belongs, say; our own rules must be the same
+            if not is_ours(expected_error):
+                return "result"  # some op of torch, on a tensor that carries a lazy negation, say
             raise FindingError(f"the compiled op accepts what the reference refuses: {expected_error!r}")
         if shapes(native) != shapes(expected):
             raise FindingError(f"results {shapes(native)}\nthe reference has {shapes(expected)}")
@@ -348,6 +386,9 @@ class Fuzzer:
         op = getattr(torch.ops.pred, name)
         result, error = attempt(lambda: op(*values))
         if error is not None:
+            large = is_large(item for value in values for item in (value if isinstance(value, list) else [value]))
+            if is_too_large(error) and not large:
+                raise FindingError(f"nothing is large, and yet: {error!r}")
             return type(error).__name__
         if name == "parallel_probe":
             return "result"
@@ -364,16 +405,6 @@ class Fuzzer:
             if not fits or any(isinstance(want, int) and have != want for have, want in sizes):
                 raise FindingError(f"{key} is {describe(value)}, its fake says {wanted.dtype}{list(wanted.shape)}")
         return "result"
-
-    @staticmethod
-    def is_large(arguments: dict[str, Any]) -> bool:
-        """Too large for the reference, which holds more than its result."""
-        sizes = [
-            max((value.numel(), *value.shape)) if isinstance(value, Tensor) else abs(value)
-            for value in arguments.values()
-            if isinstance(value, (Tensor, int))
-        ]
-        return max(sizes, default=0) > 1e6
 
 
 # --- child and parent ------------------------------------------------------------------------------

@@ -161,7 +161,13 @@ def test_pure_python_package_works(tmp_path: Path) -> None:
     assert "PRED_BACKEND=native, but the compiled kernels are missing (the package was never built)" in failing.stderr
 
 
+def test_any_number_of_empty_rays(native: None) -> None:
+    assert torch.ops.pred.sdf_to_alpha(torch.empty(2**62, 0), torch.tensor(2.7), False, None).shape == (2**62, 0)
+
+
 def test_sizes_whose_products_overflow_are_refused(native: None) -> None:
+    with pytest.raises(KERNEL_ERROR, match=r"composite_alpha: alpha must have fewer than 2\^40 rays, got 2305843"):
+        torch.ops.pred.composite_alpha(torch.empty(2**61, 0), None, None, None, 0.0, False)
     with pytest.raises(KERNEL_ERROR, match=r"composite_alpha: values must have fewer than 2\^31 channels, got 2305843"):
         values = torch.empty(3, 0, 2**61)
         torch.ops.pred.composite_alpha(torch.zeros(3, 0), None, values, None, 0.0, False)

@@ -91,6 +91,7 @@ struct CompositeInputs {
       samples = {num_rays, source.size(1)};
       args.rows = {nullptr, source.size(1)};
     }
+    PRED_CHECK(num_rays < int64_t(1) << 40, op, ": ", source_name, " must have fewer than 2^40 rays, got ", num_rays);
     args.source = keep<T>(source);
     args.t = pointer<T>("t", t, samples);
     args.depth_mid = depth_mid;

@@ -229,6 +229,9 @@ struct SampleGrid {
     const auto& a = in.args;
     const auto& k = Op::template table<S>();
     if (in.map.numel() == 0) return new_channels_last(in.map);  // whatever its other sizes are
+    PRED_CHECK(in.num_samples() < int64_t(1) << 31, in.op,
+               ": grid must have fewer than 2^31 samples where the gradient of ", Op::kMap, " is wanted, got ",
+               in.num_samples());
     SampleGridOrder order{nullptr, bits_for(in.num_samples()), {}};
     int cell_bits = 0;
     for (int axis = 0; axis < kAxes; ++axis) {

@@ -43,6 +43,7 @@ struct Rays {
     } else {
       args.rows.num_samples = sdf.size(1);
     }
+    if (sdf.numel() == 0) return;  // however many rays
     int64_t size = 0;
     for (int64_t ray = 0; ray < num_rays; ++ray) {
       size += ray_count(args.rows, ray);

@@ -60,7 +60,7 @@ PRED_HOST_DEVICE void write_coords(Item item, const VoxelKeyBits& bits, int64_t*
 // S: the type in which points are stored.
 template <typename S>
 struct VoxelizePoints {
-  const S* points;  // [N, D], element strides below
+  const S* points;  // [N, C], element strides below
   int64_t point_stride, axis_stride;
   VoxelGrid<Compute<S>> grid;
   VoxelKeyBits bits;

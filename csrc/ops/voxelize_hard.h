@@ -21,7 +21,7 @@ struct VoxelizeHardArgs {
   const Item* items;  // sorted
   int64_t num_items;
   VoxelKeyBits bits;
-  const S* points;              // [N, D], contiguous
+  const S* points;              // [N, C], contiguous
   int64_t columns, max_points;  // D, P
 };
 

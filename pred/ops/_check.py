@@ -70,11 +70,18 @@ def check_features(op: str, name: str, features: Tensor, other_name: str, geomet
 
 
 def check_number(op: str, name: str, value: object) -> None:
-    """``value`` must be a plain number. In a compiled graph it may be symbolic, and is not looked at."""
+    """``value`` must be a plain number that a float holds. In a compiled graph it may be symbolic, and is not looked
+    at."""
     if torch.compiler.is_compiling():
         return
     if isinstance(value, Tensor) or not hasattr(value, "__float__"):
         raise TypeError(f"{op}: {name} must be a number, got {type(value).__name__}")
+    try:
+        float(value)
+    except TypeError:  # an array of several
+        raise TypeError(f"{op}: {name} must be a number, got {type(value).__name__}") from None
+    except OverflowError:
+        raise ValueError(f"{op}: {name} must be in the range of float64, got a larger whole number") from None
 
 
 def check_count(op: str, name: str, value: int, least: int = 0) -> None:

@@ -12,7 +12,7 @@ from pred.ops._check import FLOATING, HALF, as_geometry, check_dtype, check_like
 def positions(op: str, name: str, points: Tensor) -> Tensor:  # [N, 3], float32 or float64
     """x, y, z of points, without their gradient; half precision becomes float32."""
     if points.dim() != 2 or points.shape[1] < 3:
-        raise ValueError(f"{op}: {name} must have shape [N, D] with D >= 3, got {list(points.shape)}")
+        raise ValueError(f"{op}: {name} must have shape [N, C] with C >= 3, got {list(points.shape)}")
     check_dtype(op, name, points, FLOATING + HALF)
     return as_geometry(points.detach()[:, :3])
 

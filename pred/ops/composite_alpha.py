@@ -105,7 +105,7 @@ def composite_alpha_reference(
     # In double: in float32 the product would lose opacities below 1e-7.
     clear = torch.cumprod(1 - alpha.double() + transmittance_eps, dim=1)
     transmittance = torch.cat([torch.ones_like(clear[:, :1]), clear[:, :-1]], dim=1)
-    weights = (transmittance * alpha).to(alpha.dtype)
+    weights = torch.where(places.valid, transmittance * alpha, 0.0).to(alpha.dtype)  # inf * 0 behind a ray's end
     return composite_reference(weights, t, values, places, depth_at, normalize_depth, normalize_eps)
 
 

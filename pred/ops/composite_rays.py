@@ -120,7 +120,7 @@ def composite_rays_reference(
     # where() twice keeps the other branch's derivative finite.
     log_phi = torch.nn.functional.logsigmoid(inv_s * sdf)
     section = alpha[:, :-1]
-    thin = section <= 0.5
+    thin = ~(section > 0.5)  # so that NaN stays NaN
     thin_tau = -torch.log1p(-torch.where(thin, section, torch.zeros_like(section)))
     tau = torch.where(thin, thin_tau, log_phi[:, :-1] - log_phi[:, 1:])
     transmittance = torch.exp(-torch.cat([torch.zeros_like(sdf[:, :1]), tau.cumsum(dim=1)], dim=1))

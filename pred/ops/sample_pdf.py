@@ -185,7 +185,7 @@ def pdf_arguments(
         check_like(op, "u", u, name, edges)
         return edges, weights, u
     if num_samples is None:
-        raise ValueError(f"{op}: num_samples or u must be given, got neither")
+        raise ValueError(f"{op}: num_samples must be given where u is not, got None")
     u = (torch.arange(num_samples, dtype=edges.dtype, device=edges.device) + 0.5) / max(num_samples, 1)
     return edges, weights, u
 

@@ -61,7 +61,7 @@ def voxelize(
     size, bounds, grid = check_voxelize_arguments("voxelize", points, batch_offsets, voxel_size, point_range)
     if _native.use_native("voxelize", points):
         return Voxels(*torch.ops.pred.voxelize(points, batch_offsets, size, bounds, grid))
-    return voxelize_reference(points, batch_offsets, size, bounds)
+    return number_voxels(points, batch_offsets, size, bounds, grid)
 
 
 def voxelize_reference(
@@ -71,12 +71,20 @@ def voxelize_reference(
     point_range: Sequence[float],
 ) -> Voxels:
     """Plain PyTorch form of :func:`voxelize`: ``torch.unique`` of linear voxel numbers."""
-    nx, ny, nz = _grid_size("voxelize", voxel_size, point_range)
+    checked = check_voxelize_arguments("voxelize", points, batch_offsets, voxel_size, point_range)
+    return number_voxels(points, batch_offsets, *checked)
+
+
+def number_voxels(
+    points: Tensor, batch_offsets: Tensor, size: list[float], bounds: list[float], grid: list[int]
+) -> Voxels:
+    """The reference after all checks."""
+    nx, ny, nz = grid
     xyz = points.detach()[:, :3]
     xyz = xyz if xyz.dtype == torch.float64 else xyz.float()
-    low, high = xyz.new_tensor(point_range[:3]), xyz.new_tensor(point_range[3:])
+    low, high = xyz.new_tensor(bounds[:3]), xyz.new_tensor(bounds[3:])
     inside = ((xyz >= low) & (xyz < high)).all(dim=1)
-    quotient = (xyz - low) / xyz.new_tensor(voxel_size)
+    quotient = (xyz - low) / xyz.new_tensor(size)
     cells = torch.tensor([nx, ny, nz], device=points.device)
     below = quotient < cells.to(xyz.dtype)
     cell = torch.where(inside[:, None] & below, quotient, torch.zeros_like(quotient)).long()
@@ -101,7 +109,7 @@ def check_voxelize_arguments(
     """Voxel size, range and grid size (x, y, z) after all checks."""
     check_tensors(op, points=points, batch_offsets=batch_offsets)
     if points.dim() != 2 or points.shape[1] < 3:
-        raise ValueError(f"{op}: points must have shape [N, D] with D >= 3, got {list(points.shape)}")
+        raise ValueError(f"{op}: points must have shape [N, C] with C >= 3, got {list(points.shape)}")
     check_dtype(op, "points", points, FLOATING + HALF)
     check_offsets(op, "batch_offsets", batch_offsets, "BN", "points", points)
     size, bounds = _floats(op, "voxel_size", voxel_size, 3), _floats(op, "point_range", point_range, 6)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pred import _native
 from pred.ops._check import check_count, check_tensors, widen
-from pred.ops.voxelize import check_voxelize_arguments, voxelize_reference
+from pred.ops.voxelize import Voxels, check_voxelize_arguments, number_voxels
 
 
 class HardVoxels(NamedTuple):
@@ -66,15 +66,11 @@ def voxelize_hard(
     dropped one 0. Equal bits for any thread count and instruction set.
     """
     _native.refuse_transforms("voxelize_hard")
-    check_tensors("voxelize_hard", points=points, batch_offsets=batch_offsets)
-    points = widen(points)
-    size, bounds, grid = check_voxelize_arguments("voxelize_hard", points, batch_offsets, voxel_size, point_range)
-    check_count("voxelize_hard", "max_points", max_points, least=1)
-    check_count("voxelize_hard", "max_voxels", max_voxels, least=1)
+    points, cells = _arguments(points, batch_offsets, voxel_size, point_range, max_points, max_voxels)
     if _native.use_native("voxelize_hard", points):
-        out = torch.ops.pred.voxelize_hard(points, batch_offsets, size, bounds, grid, max_points, max_voxels)
+        out = torch.ops.pred.voxelize_hard(points, batch_offsets, *cells, max_points, max_voxels)
         return HardVoxels(*out[:3])
-    return voxelize_hard_reference(points, batch_offsets, size, bounds, max_points, max_voxels)
+    return _gather(points, number_voxels(points, batch_offsets, *cells), batch_offsets, max_points, max_voxels)
 
 
 def voxelize_hard_reference(
@@ -86,8 +82,30 @@ def voxelize_hard_reference(
     max_voxels: int,
 ) -> HardVoxels:
     """Plain PyTorch form of :func:`voxelize_hard`: two sorts on top of :func:`pred.ops.reference.voxelize`."""
+    points, cells = _arguments(points, batch_offsets, voxel_size, point_range, max_points, max_voxels)
+    return _gather(points, number_voxels(points, batch_offsets, *cells), batch_offsets, max_points, max_voxels)
+
+
+def _arguments(
+    points: Tensor,
+    batch_offsets: Tensor,
+    voxel_size: Sequence[float],
+    point_range: Sequence[float],
+    max_points: int,
+    max_voxels: int,
+) -> tuple[Tensor, tuple[list[float], list[float], list[int]]]:
+    """Points, and voxel size, range and grid size (x, y, z), after all checks."""
+    op = "voxelize_hard"
+    check_tensors(op, points=points, batch_offsets=batch_offsets)
     points = widen(points)
-    found = voxelize_reference(points, batch_offsets, voxel_size, point_range)
+    cells = check_voxelize_arguments(op, points, batch_offsets, voxel_size, point_range)
+    check_count(op, "max_points", max_points, least=1)
+    check_count(op, "max_voxels", max_voxels, least=1)
+    return points, cells
+
+
+def _gather(points: Tensor, found: Voxels, batch_offsets: Tensor, max_points: int, max_voxels: int) -> HardVoxels:
+    """The tables of voxels that are found."""
     rows = (found.point_to_voxel >= 0).nonzero()[:, 0]
     voxel = found.point_to_voxel[rows]
     # The n-th point of its voxel, n from 0: its place in a stable sort by voxel, less the voxel's first place.

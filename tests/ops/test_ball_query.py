@@ -138,7 +138,7 @@ def test_compiles_to_one_graph(native: None) -> None:
 
 def test_errors(backend: str) -> None:
     points, batch = cloud("normal", 10), torch.tensor([0, 10])
-    with pytest.raises(ValueError, match=r"ball_query: points must have shape \[N, D\] with D >= 3, got \[10, 2\]"):
+    with pytest.raises(ValueError, match=r"ball_query: points must have shape \[N, C\] with C >= 3, got \[10, 2\]"):
         ball_query(points[:, :2], batch, points, batch, 1.0, 3)
     with pytest.raises(TypeError, match="ball_query: queries must have the dtype of points"):
         ball_query(points, batch, points.double(), batch, 1.0, 3)

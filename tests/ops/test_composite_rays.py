@@ -115,13 +115,31 @@ def test_sharp_surfaces_stay_finite(backend: str, sharp: float, dtype: torch.dty
         assert (weights - expected).abs().max() <= 1e-6
 
 
-# (d_0, d_1, s, opacity, d opacity / d d_0, d opacity / d d_1) of a ray of two samples.
+def sigmoid(x: float) -> float:
+    return 1 / (1 + math.exp(-x))
+
+
+# (d_0, d_1, s, opacity, d opacity / d d_0, d opacity / d d_1) of a ray of two samples, by its definition
+# 1 - Phi(d_1) / Phi(d_0), whose derivatives are s ratio (1 - Phi) of either end; far inside Phi(d) is exp(s d).
 TWO_SAMPLES = {
-    "falling, inside": (-2.0, -2.1, 64.0, 0.998338, 0.106339, -0.106339),
+    "falling, inside": (-2.0, -2.1, 64.0, 1 - math.exp(-6.4), 64 * math.exp(-6.4), -64 * math.exp(-6.4)),
     "rising, inside": (-3.0, -2.9, 64.0, 0.0, 0.0, 0.0),
-    "nearly flat, inside": (-1.0, -1.0001, 64.0, 0.00638, 63.59, -63.59),
-    # Phi(5.8) = 0.9969816, Phi(6) = 0.9975274: 1 - ratio; s ratio (1 - Phi) of either end
-    "small crossing": (0.3, 0.29, 20.0, 5.4715e-4, 20 * 0.9994528 * 0.0024726, -20 * 0.9994528 * 0.0030184),
+    "nearly flat, inside": (
+        -1.0,
+        -1.0001,
+        64.0,
+        1 - math.exp(-0.0064),
+        64 * math.exp(-0.0064),
+        -64 * math.exp(-0.0064),
+    ),
+    "small crossing": (
+        0.3,
+        0.29,
+        20.0,
+        1 - sigmoid(5.8) / sigmoid(6),
+        20 * sigmoid(5.8) / sigmoid(6) * sigmoid(-6),
+        -20 * sigmoid(5.8) / sigmoid(6) * sigmoid(-5.8),
+    ),
     "tie": (0.5, 0.5, 64.0, 0.0, 0.0, 0.0),
     "free space": (10.0, 9.0, 64.0, 0.0, 0.0, 0.0),
 }
@@ -134,12 +152,14 @@ def test_two_samples(backend: str, name: str, dtype: torch.dtype) -> None:
     before, after, inv_s, opacity, grad_before, grad_after = TWO_SAMPLES[name]
     sdf = torch.tensor([[before, after]], dtype=dtype, requires_grad=True)
     out = composite_rays(sdf, inv_s, torch.tensor([[3.0, 5.0]], dtype=dtype))
-    # A difference of 1e-4 between float32 numbers near 1 is exact to 6e-4 only.
-    rel = 1e-3 if name == "nearly flat, inside" else 2e-5
+    # Both distances are rounded, which changes exp(s (d_1 - d_0)) by s times as much, and 1 - exp() by the share of it in
+    # their difference.
+    eps, difference = torch.finfo(dtype).eps, abs(before - after) or 1.0
+    rel = 8 * eps + eps * max(abs(before), abs(after)) * (inv_s + 1 / difference)
     assert out.opacity.item() == pytest.approx(opacity, rel=rel, abs=1e-12)
     assert depth(out).item() == pytest.approx(3 * opacity, rel=rel, abs=1e-12)
     (grad,) = torch.autograd.grad(out.opacity.sum(), sdf)
-    assert grad[0].tolist() == pytest.approx([grad_before, grad_after], rel=1e-4, abs=1e-12)
+    assert grad[0].tolist() == pytest.approx([grad_before, grad_after], rel=rel, abs=1e-12)
 
 
 def test_last_sample(backend: str) -> None:
@@ -202,13 +222,28 @@ def test_free_space_is_empty(backend: str) -> None:
 
 
 def test_transmittance_underflow(backend: str) -> None:
-    """Hundreds of half-opaque samples: weights vanish, nothing becomes NaN, and they add up to 1."""
+    """400 samples down to s d = -511: T_i = Phi_i / Phi_0 runs out of the range of any float; weights vanish, nothing
+    becomes NaN, and they add up to 1.
+
+    With w_i = (Phi_i - Phi_{i+1}) / Phi_0, Phi_0 = 1 / 2 and ranges in steps of h, depth = t_0 + 2 h sum_{i>0} Phi_i.
+    """
+    inv_s, step = 64.0, 49 / 399
     sdf = -torch.arange(400.0)[None] * 0.02
     sdf.requires_grad_()
-    out = composite_rays(sdf, 64.0, torch.linspace(1, 50, 400)[None])
+    out = composite_rays(sdf, inv_s, torch.linspace(1, 50, 400)[None])
+    phi = [sigmoid(max(-inv_s * 0.02 * i, -700)) for i in range(400)]
+    expected = 1 + 2 * step * sum(phi[1:])
+    assert out.weights[0, [0, 3, 20]].tolist() == pytest.approx(
+        [2 * (phi[i] - phi[i + 1]) for i in (0, 3, 20)], rel=1e-5
+    )
+    assert out.weights[0, 350:].tolist() == [0.0] * 50
     assert out.opacity.item() == pytest.approx(1.0, abs=1e-6)
-    depth(out).sum().backward()
-    assert sdf.grad is not None and sdf.grad.isfinite().all()
+    assert depth(out).item() == pytest.approx(expected, rel=1e-6)
+    (grad,) = torch.autograd.grad(depth(out).sum(), sdf)
+    # d depth / d Phi_0 = (t_0 - depth) / Phi_0, d depth / d Phi_k = 2 h; dPhi / dd = s Phi (1 - Phi).
+    slopes = [inv_s * (1 - expected) / 2, *(2 * step * inv_s * p * (1 - p) for p in phi[1:60])]
+    assert grad[0, :60].tolist() == pytest.approx(slopes, rel=1e-4, abs=1e-30)
+    assert grad.isfinite().all() and not grad[0, 350:].any()
 
 
 SHAPES = [(1, 1, 1), (2, 2, 3), (3, 15, 19), (3, 16, 1), (3, 17, 16), (5, 33, 17), (4, 224, 19), (2, 257, 32)]

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
@@ -79,13 +79,20 @@ def test_native_equals_reference_at_every_level(level: str, example: Example, dt
         assert_like_reference(example, example.example(count, dtype, seed=count))
 
 
-@every_example
-def test_bitwise_equal_for_any_thread_count_and_from_run_to_run(native: None, example: Example) -> None:
-    arguments = example.example(example.many)
+@pytest.mark.parametrize(
+    "example,dtype",
+    [(x, torch.float32) for x in EXAMPLES] + [(x, torch.bfloat16) for x in EXAMPLES if x.features],
+    ids=str,
+)
+def test_bitwise_equal_for_any_thread_count_and_from_run_to_run(
+    level: str, example: Example, dtype: torch.dtype
+) -> None:
+    arguments = example.example(example.many, dtype)
+    order = order_of(example) if dtype not in HALF else min(order_of(example), 1)
     found = []
     for threads in (1, 2, 7, 7):
         torch.set_num_threads(threads)
-        found.append(evaluate(example.native, arguments, example.leaves(arguments), order_of(example)))
+        found.append(evaluate(example.native, arguments, example.leaves(arguments), order))
     for threads, other in zip((2, 7, 7), found[1:], strict=True):
         assert_same_bits(other, found[0], f"with {threads} threads")
 
@@ -100,10 +107,23 @@ REFERENCE_GRAPHS = {example.op: example for example in reversed(EXAMPLES) if exa
     indirect=["backend"],
     ids=str,
 )
-def test_one_graph_and_two_compilations(backend: str, example: Example, request: pytest.FixtureRequest) -> None:
-    """The first for the sizes that came first, the second for all others."""
+def test_one_graph_and_two_compilations(backend: str, example: Example) -> None:
+    """The first for the sizes that came first, the second for all others from 2 on."""
+    assert compilations(example, (37, 21, 50, 8, 64)) <= 2
+
+
+FIRST_EXAMPLES = {example.op: example for example in reversed(EXAMPLES)}
+
+
+@pytest.mark.parametrize("op", sorted(FIRST_EXAMPLES))
+def test_sizes_0_and_1_have_graphs_of_their_own(native: None, op: str) -> None:
+    """torch.compile takes them for constants: one more compilation each, in whatever order they come."""
+    assert compilations(FIRST_EXAMPLES[op], (1, 37, 0, 21, 1, 0, 50)) <= 4
+
+
+def compilations(example: Example, counts: Sequence[int]) -> int:
+    """How many graphs calls of these sizes need. Each call's values and gradients are those of the eager op."""
     torch._dynamo.reset()
-    request.addfinalizer(torch._dynamo.reset)
     torch._dynamo.utils.counters.clear()
     leaves = example.leaves(example.example(2))
     order = min(order_of(example), 1)
@@ -112,7 +132,7 @@ def test_one_graph_and_two_compilations(backend: str, example: Example, request:
         return outputs(example.native(**arguments))
 
     compiled = torch.compile(call, fullgraph=True, backend="aot_eager")
-    for count in (37, 21, 50, 8, 64):
+    for count in counts:
         arguments = example.example(count, torch.float64)
         with torch._dynamo.config.patch(capture_dynamic_output_shape_ops=True):
             actual = evaluate(lambda **kwargs: tuple(compiled(**kwargs).values()), arguments, leaves, order)
@@ -122,7 +142,9 @@ def test_one_graph_and_two_compilations(backend: str, example: Example, request:
                 assert_close(value, expected[name], 1e-12, f"{name} of {count}")
             else:
                 assert torch.equal(value, expected[name]), f"{name} of {count}"
-    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] <= 2
+    graphs = int(torch._dynamo.utils.counters["stats"]["unique_graphs"])
+    torch._dynamo.reset()
+    return graphs
 
 
 @every_example
@@ -137,7 +159,8 @@ def test_vmap_is_refused_by_name(backend: str, example: Example) -> None:
 
 @every_example
 def test_wrong_tensors_are_named(backend: str, example: Example) -> None:
-    """Another rank, dtype, device or type: ``op: argument must <rule>, got <fact>``, from both backends."""
+    """Another rank, dtype, device or type: ``op: argument must <rule>, got <fact>``, from both backends and from the
+    reference when it is called itself."""
     arguments = example.example(6)
     tensors = {name: value for name, value in arguments.items() if isinstance(value, Tensor)}
     for name, value in tensors.items():
@@ -146,14 +169,20 @@ def test_wrong_tensors_are_named(backend: str, example: Example) -> None:
             wrong["rank"] = value[None, None, None]
         if len(tensors) > 1:
             wrong["device"] = value.to("meta")
+        names = "|".join(tensors)
         for what, replacement in wrong.items():
-            names = "|".join(tensors)
-            with pytest.raises((ValueError, TypeError), match=rf"^{example.op}: ({names}) must .*, got ") as raised:
-                example.native(**{**arguments, name: replacement})
-            assert isinstance(raised.value, TypeError if what in ("list", "dtype") else ValueError), f"{what} of {name}"
+            for function in (example.native, example.reference):
+                with pytest.raises((ValueError, TypeError), match=rf"^{example.op}: ({names}) must .*, got ") as raised:
+                    function(**{**arguments, name: replacement})
+                kind = TypeError if what in ("list", "dtype") else ValueError
+                assert isinstance(raised.value, kind), f"{what} of {name}"
 
 
-WRONG_PLAIN: dict[type, tuple[Any, ...]] = {bool: ("yes", None), int: (2.5, "2", None), float: ("2", [2.0])}
+WRONG_PLAIN: dict[type, tuple[Any, ...]] = {
+    bool: ("yes", None),
+    int: (2.5, "2", None),
+    float: ("2", [2.0], torch.tensor(2.0), 10**400),
+}
 
 
 @every_example
@@ -166,8 +195,11 @@ def test_wrong_plain_arguments_are_named(backend: str, example: Example) -> None
         for replacement in WRONG_PLAIN.get(type(value), ()):
             if replacement is None and parameters[name].default is None:
                 continue
-            with pytest.raises((TypeError, ValueError), match=rf"^{example.op}: {name} must .*, got "):
-                example.native(**{**arguments, name: replacement})
+            if isinstance(replacement, Tensor) and name == "inv_s":
+                continue  # may be one
+            for function in (example.native, example.reference):
+                with pytest.raises((TypeError, ValueError), match=rf"^{example.op}: {name} must .*, got "):
+                    function(**{**arguments, name: replacement})
 
 
 @every_example

@@ -128,7 +128,7 @@ def test_compiles_to_one_graph(native: None) -> None:
 
 def test_errors(backend: str) -> None:
     points, batch = cloud("normal", 10), torch.tensor([0, 10])
-    with pytest.raises(ValueError, match=r"sample: points must have shape \[N, D\] with D >= 3, got \[10, 2\]"):
+    with pytest.raises(ValueError, match=r"sample: points must have shape \[N, C\] with C >= 3, got \[10, 2\]"):
         farthest_point_sample(points[:, :2], batch, 3)
     with pytest.raises(TypeError, match="farthest_point_sample: points must be float32 or .*, got int64"):
         farthest_point_sample(points.long(), batch, 3)

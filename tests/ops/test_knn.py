@@ -153,9 +153,9 @@ def test_compiles_to_one_graph(native: None) -> None:
 
 def test_errors(backend: str) -> None:
     points, batch = cloud("normal", 10), torch.tensor([0, 10])
-    with pytest.raises(ValueError, match=r"knn: points must have shape \[N, D\] with D >= 3, got \[10, 2\]"):
+    with pytest.raises(ValueError, match=r"knn: points must have shape \[N, C\] with C >= 3, got \[10, 2\]"):
         knn(points[:, :2], batch, points, batch, 3)
-    with pytest.raises(ValueError, match=r"knn: queries must have shape \[N, D\] with D >= 3, got \[10\]"):
+    with pytest.raises(ValueError, match=r"knn: queries must have shape \[N, C\] with C >= 3, got \[10\]"):
         knn(points, batch, points[:, 0], batch, 3)
     with pytest.raises(TypeError, match="knn: points must be float32 or .*, got int64"):
         knn(points.long(), batch, points, batch, 3)

@@ -345,7 +345,7 @@ def test_errors(backend: str) -> None:
         sample_pdf(edges[:, :1], weights[:, :1], 4)
     with pytest.raises(ValueError, match="sample_pdf: num_samples must be at least 0, got -1"):
         sample_pdf(edges, weights, -1)
-    with pytest.raises(ValueError, match="sample_pdf: num_samples or u must be given, got neither"):
+    with pytest.raises(ValueError, match="sample_pdf: num_samples must be given where u is not, got None"):
         sample_pdf(edges, weights)
     with pytest.raises(ValueError, match="sample_pdf: mode must be one of exact, neus, nerfstudio, got 'unipad'"):
         sample_pdf(edges, weights, 4, mode="unipad")

@@ -454,7 +454,7 @@ def test_rounding_to_half_is_to_nearest_even(level: str, dtype: torch.dtype) -> 
     """Means of two neighbouring numbers are ties; means of others round as torch does."""
     numbers = torch.arange(0, 1 << 15).to(torch.int16).view(dtype)
     numbers = torch.cat([numbers[numbers.isfinite()], -numbers[numbers.isfinite()]])
-    other = torch.cat([numbers[1:].roll(0), numbers[:1]])
+    other = numbers.roll(-1)
     bev = torch.stack([numbers, other], dim=-1)[None, :, None]  # [1, C, 1, 2]
     out = sample_bev(bev, torch.zeros(1, 1, 2))[0, 0]
     assert torch.equal(out, (numbers.float() * 0.5 + other.float() * 0.5).to(dtype))

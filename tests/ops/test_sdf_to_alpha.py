@@ -570,7 +570,7 @@ def test_annealing_does_not_compile_again(native: None) -> None:
     for step in range(12):
         expected = ours(inputs[0], inputs[0].new_full((), 2.7), *inputs[1:], step / 20, 0.0)
         assert_close(compiled(*inputs, step / 20), expected, 1e-13)
-    assert counter.frame_count <= 3
+    assert counter.frame_count <= 2  # the first number, and all others
 
 
 def test_modes_are_bitwise_equal_for_any_thread_count(native: None) -> None:
@@ -718,3 +718,9 @@ def test_huge_distances_under_a_small_sharpness(level: str) -> None:
     sdf = torch.tensor([[3e36, 2e36, -1e36, -3e38]])
     expected = reference.sdf_to_alpha(sdf.double(), 1e-36)
     assert_close(sdf_to_alpha(sdf, 1e-36), expected.float(), FORWARD[torch.float32])
+
+
+def test_packed_column_is_packed(backend: str) -> None:
+    sdf, offsets = torch.tensor([3.0, 1.0, -1.0, 2.0, -2.0]), torch.tensor([0, 3, 5])
+    alpha = sdf_to_alpha(sdf[:, None], 2.7, ray_offsets=offsets)
+    assert torch.equal(alpha, sdf_to_alpha(sdf, 2.7, ray_offsets=offsets))

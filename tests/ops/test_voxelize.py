@@ -213,7 +213,7 @@ def test_compiles_to_one_graph(native: None) -> None:
 
 def test_errors(backend: str) -> None:
     points, offsets = cloud(10), torch.tensor([0, 10])
-    with pytest.raises(ValueError, match=r"voxelize: points must have shape \[N, D\] with D >= 3, got \[10, 2\]"):
+    with pytest.raises(ValueError, match=r"voxelize: points must have shape \[N, C\] with C >= 3, got \[10, 2\]"):
         voxelize(points[:, :2], offsets, SIZES[0], RANGE)
     with pytest.raises(TypeError, match="voxelize: points must be float32 or .* or float16, got int64"):
         voxelize(points.long(), offsets, SIZES[0], RANGE)

@@ -266,7 +266,7 @@ def test_autocast_computes_in_float32(backend: str) -> None:
 
 def test_errors(backend: str) -> None:
     points, offsets = cloud(10), torch.tensor([0, 10])
-    with pytest.raises(ValueError, match=r"voxelize_hard: points must have shape \[N, D\] with D >= 3, got \[10, 2\]"):
+    with pytest.raises(ValueError, match=r"voxelize_hard: points must have shape \[N, C\] with C >= 3, got \[10, 2\]"):
         voxelize_hard(points[:, :2], offsets, SIZES[0], RANGE, 1, 1)
     with pytest.raises(TypeError, match="voxelize_hard: points must be float32 or .*, got int64"):
         voxelize_hard(points.long(), offsets, SIZES[0], RANGE, 1, 1)
