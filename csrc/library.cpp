@@ -44,6 +44,17 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "sample_volume_with_grad_backward(Tensor? grad_values, Tensor? grad_grads, Tensor volume, Tensor grid, "
       "bool border, bool align_corners, bool need_volume, bool need_grid) -> (Tensor, Tensor)");
 
+  m.def(
+      "decode_field(Tensor projected, Tensor points, Tensor parameters, int[] widths, float[] point_range, int "
+      "octaves, "
+      "float beta, float sdf_scale, bool with_gradient, bool keep) -> "
+      "(Tensor sdf, Tensor semantics, Tensor gradient, Tensor activation, Tensor chain)");
+  m.def(
+      "decode_field_backward(Tensor? grad_sdf, Tensor? grad_semantics, Tensor? grad_gradient, Tensor projected, "
+      "Tensor points, Tensor parameters, Tensor activation, Tensor chain, int[] widths, float[] point_range, "
+      "int octaves, float beta, float sdf_scale, bool need_projected, bool need_points, bool need_parameters) -> "
+      "(Tensor, Tensor, Tensor)");
+
   m.def("segment_reduce(Tensor features, Tensor index, SymInt num_segments, str reduce) -> (Tensor, Tensor)");
   m.def("segment_reduce_backward(Tensor grad, Tensor index, Tensor saved, str reduce) -> Tensor");
 

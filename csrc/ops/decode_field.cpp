@@ -1,0 +1,327 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+#include "ops/decode_field.h"
+
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/ops.h>
+
+#include <algorithm>
+#include <memory>
+#include <optional>
+#include <tuple>
+#include <vector>
+
+#include "common/check.h"
+#include "common/parallel.h"
+#include "ops/sample_bev.h"
+
+namespace pred {
+namespace {
+
+template <typename S>
+const FieldKernels<S>& field_kernels() {
+  if constexpr (std::is_same_v<S, float>)
+    return PRED_KERNELS(decode_field_f32);
+  else if constexpr (std::is_same_v<S, double>)
+    return PRED_KERNELS(decode_field_f64);
+  else
+    return PRED_KERNELS(decode_field_bf16);
+}
+
+// Calls `body` with S, the type of the projected map, and T = Compute<S>.
+#define PRED_DISPATCH_FIELD(op, dtype, ...)                                                            \
+  [&] {                                                                                                \
+    switch (dtype) {                                                                                   \
+      case ::pred::ScalarType::BFloat16: {                                                             \
+        using S = ::pred::BFloat16;                                                                    \
+        return __VA_ARGS__();                                                                          \
+      }                                                                                                \
+      case ::pred::ScalarType::Float: {                                                                \
+        using S = float;                                                                               \
+        return __VA_ARGS__();                                                                          \
+      }                                                                                                \
+      case ::pred::ScalarType::Double: {                                                               \
+        using S = double;                                                                              \
+        return __VA_ARGS__();                                                                          \
+      }                                                                                                \
+      default:                                                                                         \
+        throw std::invalid_argument(std::string(op) + ": dtype must be float32, float64 or bfloat16"); \
+    }                                                                                                  \
+  }()
+
+// Samples per task of the forward pass.
+constexpr int64_t kForwardGrain = 960;
+// A block of samples has its own sums of the parameters' gradients, which are then added in order: no more blocks than
+// kMaxBlocks, nor smaller ones than kLeastBlock. Multiples of a tile.
+constexpr int64_t kLeastBlock = 1920, kMaxBlocks = 64;
+
+template <typename S>
+struct Field {
+  using T = Compute<S>;
+  const char* op;
+  Tensor map, points, parameters;
+  std::vector<int64_t> widths;  // encoding, hidden ..., outputs
+  std::unique_ptr<S[]> zeros;
+  std::vector<S> packed;
+  std::vector<std::vector<T>> padded;  // biases and the row of the distance
+  std::vector<T> grid;                 // [B N, 2], made where wanted
+  int64_t batch, num_samples, stride;
+  FieldArgs<S> args{};
+
+  Field(const char* name, const Tensor& map_in, const Tensor& points_in, const Tensor& parameters_in,
+        const std::vector<int64_t>& widths_in, const std::vector<double>& point_range, int64_t octaves, double beta,
+        double sdf_scale)
+      : op(name), widths(widths_in) {
+    constexpr ScalarType dtype = std::is_same_v<T, double> ? ScalarType::Double : ScalarType::Float;
+    check_cpu_tensor(op, "projected", map_in, 4, map_in.scalar_type());
+    check_cpu_tensor(op, "points", points_in, 3, dtype);
+    check_cpu_tensor(op, "parameters", parameters_in, 1, dtype);
+    batch = map_in.size(0);
+    num_samples = batch * points_in.size(1);
+    PRED_CHECK(points_in.size(0) == batch && points_in.size(2) == 3, op, ": points must have shape [", batch,
+               ", N, 3], got ", shape_text(points_in));
+    const int64_t layers = int64_t(widths.size()) - 1, width = map_in.size(1);
+    PRED_CHECK(layers >= 2 && layers <= kMaxHidden + 1, op, ": widths must name 2 to ", kMaxHidden + 1, " layers, got ",
+               layers);
+    PRED_CHECK(octaves >= 0 && octaves <= 20 && widths[0] == 3 + 6 * octaves, op,
+               ": widths must start with 3 + 6 octaves, octaves in [0, 20], got ", widths[0]);
+    int64_t expected = 0;
+    for (int64_t l = 0; l < layers; ++l) {
+      const bool fits = l + 1 < layers ? widths[l + 1] == width : widths[l + 1] >= 1 && widths[l + 1] < 1 << 20;
+      PRED_CHECK(fits, op, ": widths must be those of projected in hidden layers, and positive, got ", widths[l + 1]);
+      expected += widths[l + 1] * (widths[l] + 1);
+    }
+    PRED_CHECK(width >= 16 && width <= 512 && width % 16 == 0, op,
+               ": projected must have a multiple of 16 channels, from 16 to 512, got ", width);
+    PRED_CHECK(parameters_in.size(0) == expected, op, ": parameters must have ", expected, " elements, got ",
+               parameters_in.size(0));
+    PRED_CHECK(point_range.size() == 6, op, ": point_range must hold 6 numbers, got ", point_range.size());
+    PRED_CHECK(beta > 0 && sdf_scale > 0, op, ": beta and sdf_scale must be positive, got ", beta, " and ", sdf_scale);
+
+    map = torch::stable::contiguous(map_in, torch::headeronly::MemoryFormat::ChannelsLast);
+    points = torch::stable::contiguous(points_in);
+    parameters = torch::stable::contiguous(parameters_in);
+    stride = field_stride(width);
+    read_geometry(point_range);
+    args.octaves = octaves;
+    args.beta = T(beta);
+    args.sdf_scale = T(sdf_scale);
+    args.num_hidden = layers - 1;
+    args.num_outputs = widths[layers];
+    pack_parameters();
+  }
+
+  int64_t columns(int64_t layer) const { return field_kernels<S>().columns(widths[layer]); }
+
+  std::vector<int64_t> saved_shape(int64_t layers) const { return {layers, num_samples, stride}; }
+
+  // Positions in the map, as sample_bev takes them.
+  void make_grid() {
+    grid.resize(2 * num_samples);
+    parallel(num_samples, 16384, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) {
+        for (int axis = 0; axis < 2; ++axis) {
+          grid[2 * i + axis] = (args.points[3 * i + axis] - args.centre[axis]) / args.half_extent[axis];
+        }
+      }
+    });
+    args.map.grid = grid.data();
+  }
+
+ private:
+  void read_geometry(const std::vector<double>& point_range) {
+    args.points = points.const_data_ptr<T>();
+    for (int axis = 0; axis < 3; ++axis) {
+      args.centre[axis] = T((point_range[axis] + point_range[axis + 3]) / 2);
+      args.half_extent[axis] = T((point_range[axis + 3] - point_range[axis]) / 2);
+      PRED_CHECK(args.half_extent[axis] > 0, op, ": point_range must have its upper bounds above its lower ones");
+    }
+    auto& m = args.map;
+    m.map = storage<S>(map);
+    m.channels = m.stride[0] = map.size(1);
+    m.num_samples = points.size(1);
+    for (int axis = 0; axis < 2; ++axis) {
+      m.size[axis] = map.size(3 - axis);
+      m.stride[axis + 1] = m.stride[axis] * m.size[axis];
+      PRED_CHECK(m.size[axis] >= 1, op, ": projected must have at least one cell along each axis, got ",
+                 shape_text(map));
+    }
+    zeros.reset(new S[m.channels]());
+    m.zeros = zeros.get();
+  }
+
+  void pack_parameters() {
+    const FieldKernels<S>& k = field_kernels<S>();
+    const int64_t layers = args.num_hidden + 1;
+    std::vector<int64_t> up(layers), down(layers), from(layers);
+    int64_t size = 0, at = 0;
+    for (int64_t l = 0; l < layers; ++l) {
+      up[l] = size;
+      size += k.packed_size(widths[l], widths[l + 1]);
+      down[l] = size;
+      size += k.packed_size(widths[l + 1], widths[l]);
+      from[l] = at;
+      at += widths[l + 1] * (widths[l] + 1);
+    }
+    const int64_t line = 64 / int64_t(sizeof(S));
+    packed.resize(size + line);
+    S* first = reinterpret_cast<S*>((reinterpret_cast<uintptr_t>(packed.data()) + 63) / 64 * 64);
+    const T* data = parameters.const_data_ptr<T>();
+    parallel(2 * layers, 1, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) {
+        const int64_t l = i / 2, in = widths[l], out = widths[l + 1];
+        if (i % 2 == 0)
+          k.pack(data + from[l], 1, in, in, out, first + up[l]);
+        else
+          k.pack(data + from[l], in, 1, out, in, first + down[l]);
+      }
+    });
+    padded.resize(layers + 1);
+    for (int64_t l = 0; l < layers; ++l) {
+      args.up[l] = first + up[l];
+      args.down[l] = first + down[l];
+      const T* bias = data + from[l] + widths[l + 1] * widths[l];
+      padded[l].assign(std::max(stride, columns(l + 1)), T(0));
+      std::copy(bias, bias + widths[l + 1], padded[l].begin());
+      args.bias[l] = padded[l].data();
+    }
+    const T* row = data + from[layers - 1];
+    padded[layers].assign(stride, T(0));
+    for (int64_t c = 0; c < widths[1]; ++c) padded[layers][c] = row[c] * args.sdf_scale;
+    args.sdf_row = padded[layers].data();
+  }
+};
+
+using Outputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor& parameters,
+                     std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
+                     double sdf_scale, bool with_gradient, bool keep) {
+  return PRED_DISPATCH_FIELD("decode_field", projected.scalar_type(), [&] {
+    using T = Compute<S>;
+    const Field<S> in("decode_field", projected, points, parameters, widths, point_range, octaves, beta, sdf_scale);
+    const int64_t frames = in.batch, count = points.size(1), classes = in.args.num_outputs - 1;
+    Tensor sdf = torch::stable::new_empty(in.points, {frames, count});
+    Tensor semantics = torch::stable::new_empty(in.points, {frames, count, classes});
+    Tensor gradient = torch::stable::new_empty(in.points, {frames, with_gradient ? count : 0, 3});
+    const int64_t layers = in.args.num_hidden;
+    Tensor activation = torch::stable::new_empty(in.map, in.saved_shape(keep ? layers : 0));
+    Tensor chain = torch::stable::new_empty(in.map, in.saved_shape(keep && with_gradient ? layers - 1 : 0));
+    const FieldSaved<S> saved{keep ? mutable_storage<S>(activation) : nullptr,
+                              keep && with_gradient ? mutable_storage<S>(chain) : nullptr};
+    const FieldOutputs<S> out{sdf.mutable_data_ptr<T>(), semantics.mutable_data_ptr<T>(),
+                              with_gradient ? gradient.mutable_data_ptr<T>() : nullptr};
+    const FieldKernels<S>& k = field_kernels<S>();
+    const int64_t bytes = k.scratch_bytes(in.args, false);
+    const int64_t tasks = (in.num_samples + kForwardGrain - 1) / kForwardGrain;
+    parallel(tasks, 1, [&](int64_t first, int64_t last) {
+      const std::unique_ptr<char[]> scratch(new char[bytes]);
+      k.forward(in.args, saved, out, scratch.get(), first * kForwardGrain,
+                std::min(last * kForwardGrain, in.num_samples), in.num_samples);
+    });
+    return Outputs(sdf, semantics, gradient, activation, chain);
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
+    std::optional<Tensor> grad_sdf, std::optional<Tensor> grad_semantics, std::optional<Tensor> grad_gradient,
+    const Tensor& projected, const Tensor& points, const Tensor& parameters, const Tensor& activation_in,
+    const Tensor& chain_in, std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
+    double sdf_scale, bool need_projected, bool need_points, bool need_parameters) {
+  const char* op = "decode_field_backward";
+  return PRED_DISPATCH_FIELD(op, projected.scalar_type(), [&] {
+    using T = Compute<S>;
+    Field<S> in(op, projected, points, parameters, widths, point_range, octaves, beta, sdf_scale);
+    const int64_t frames = in.batch, count = points.size(1), classes = in.args.num_outputs - 1;
+    std::vector<Tensor> kept;
+    const auto cotangent = [&](const char* name, const std::optional<Tensor>& tensor,
+                               const std::vector<int64_t>& shape) -> const T* {
+      if (!tensor) return nullptr;
+      check_cpu_tensor(op, name, *tensor, int64_t(shape.size()), in.points.scalar_type());
+      check_sizes(op, name, *tensor, shape);
+      kept.push_back(torch::stable::contiguous(*tensor));
+      return kept.back().template const_data_ptr<T>();
+    };
+    const FieldCotangents<S> grad{cotangent("grad_sdf", grad_sdf, {frames, count}),
+                                  cotangent("grad_semantics", grad_semantics, {frames, count, classes}),
+                                  cotangent("grad_gradient", grad_gradient, {frames, count, 3})};
+    const auto saved_rows = [&](const char* name, const Tensor& tensor, int64_t layers) -> S* {
+      check_cpu_tensor(op, name, tensor, 3, projected.scalar_type());
+      if (tensor.size(0) == 0) return nullptr;
+      check_sizes(op, name, tensor, in.saved_shape(layers));
+      kept.push_back(torch::stable::contiguous(tensor));
+      return mutable_storage<S>(kept.back());
+    };
+    const FieldSaved<S> saved{saved_rows("activation", activation_in, in.args.num_hidden),
+                              saved_rows("chain", chain_in, in.args.num_hidden - 1)};
+
+    const int64_t width = in.args.map.channels, layers = in.args.num_hidden + 1;
+    const auto rows = [&](bool wanted) {
+      return std::unique_ptr<S[]>(wanted ? new S[in.num_samples * width] : nullptr);
+    };
+    const std::unique_ptr<S[]> along_map = rows(need_projected), along_slope = rows(need_projected && grad.gradient);
+    std::vector<T> directions(need_projected && grad.gradient ? 2 * in.num_samples : 0);
+    Tensor out_points = torch::stable::new_empty(in.points, {need_points ? frames : 0, count, 3});
+    Tensor out_parameters = torch::stable::new_empty(in.parameters, {need_parameters ? parameters.size(0) : 0});
+
+    // Each block's sums: dW [outputs, columns] and db of one layer after the other.
+    int64_t block_sums = 0;
+    for (int64_t l = 0; l < layers; ++l) block_sums += widths[l + 1] * (in.columns(l) + 1);
+    const int64_t wanted_block = (in.num_samples + kMaxBlocks - 1) / kMaxBlocks;
+    const int64_t block = (std::max(wanted_block, kLeastBlock) + kLeastBlock - 1) / kLeastBlock * kLeastBlock;
+    const int64_t num_blocks = (in.num_samples + block - 1) / block;
+    const std::unique_ptr<T[]> sums(need_parameters ? new T[num_blocks * block_sums] : nullptr);
+    const FieldKernels<S>& k = field_kernels<S>();
+    const int64_t bytes = k.scratch_bytes(in.args, true);
+    parallel(num_blocks, 1, [&](int64_t first, int64_t last) {
+      const std::unique_ptr<char[]> scratch(new char[bytes]);
+      for (int64_t b = first; b < last; ++b) {
+        T* part = sums ? sums.get() + b * block_sums : nullptr;
+        if (part) std::fill(part, part + block_sums, T(0));
+        const FieldGradients<S> out{part, along_map.get(), along_slope.get(),
+                                    directions.empty() ? nullptr : directions.data(),
+                                    need_points ? out_points.mutable_data_ptr<T>() : nullptr};
+        k.backward(in.args, saved, grad, out, scratch.get(), b * block, std::min((b + 1) * block, in.num_samples),
+                   in.num_samples);
+      }
+    });
+
+    if (need_parameters) {
+      T* to = out_parameters.mutable_data_ptr<T>();
+      const T* from = sums.get();
+      for (int64_t l = 0; l < layers; ++l) {
+        const int64_t outputs = widths[l + 1], inputs = widths[l], columns = in.columns(l);
+        parallel(outputs + 1, 16, [&](int64_t begin, int64_t end) {
+          for (int64_t row = begin; row < end; ++row) {  // the row behind the last one: db
+            T* sum = to + row * inputs;
+            const int64_t elements = row < outputs ? inputs : outputs;
+            std::fill(sum, sum + elements, T(0));
+            for (int64_t b = 0; b < num_blocks; ++b) {
+              const T* part = from + b * block_sums + row * columns;
+              for (int64_t i = 0; i < elements; ++i) sum[i] += part[i];
+            }
+          }
+        });
+        to += outputs * (inputs + 1);
+        from += outputs * (columns + 1);
+      }
+    }
+    Tensor out_map = torch::stable::new_empty(in.map, {0});
+    if (need_projected) {
+      in.make_grid();
+      in.args.map.grad = along_map.get();
+      in.args.map.grad_along = along_slope.get();
+      in.args.map.grad_grad_grid = directions.empty() ? nullptr : directions.data();
+      out_map = SampleBev::scatter<S>(op, in.map, in.args.map, false, nullptr);
+    }
+    return std::make_tuple(out_map, out_points, out_parameters);
+  });
+}
+
+}  // namespace
+}  // namespace pred
+
+STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) {
+  m.impl("decode_field", TORCH_BOX(&pred::decode_field));
+  m.impl("decode_field_backward", TORCH_BOX(&pred::decode_field_backward));
+}
