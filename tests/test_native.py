@@ -171,6 +171,6 @@ def test_sizes_whose_products_overflow_are_refused(native: None) -> None:
     with pytest.raises(KERNEL_ERROR, match=r"composite_alpha: values must have fewer than 2\^31 channels, got 2305843"):
         values = torch.empty(3, 0, 2**61)
         torch.ops.pred.composite_alpha(torch.zeros(3, 0), None, values, None, 0.0, False)
-    with pytest.raises(KERNEL_ERROR, match="voxelize_hard: max_points times 4 columns must fit int64, got 2305843"):
+    with pytest.raises(KERNEL_ERROR, match=r"voxelize_hard: max_points must be less than 2\^63 / C with C=4, got 23"):
         grid = ([0.1] * 3, [0.0] * 3 + [1.0] * 3, [10] * 3)
         torch.ops.pred.voxelize_hard(torch.zeros(0, 4), torch.tensor([0, 0]), *grid, 2**61, 1)

@@ -76,8 +76,8 @@ Outputs fill_voxels(const VoxelizeInputs& in, const Tensor& points, const Sorted
   const VoxelizeHardKernels<M, Item>& k = kernels<M, Item>();
   const int64_t num_points = in.num_points(), columns = points.size(1);
   int64_t voxel_elements;
-  PRED_CHECK(!__builtin_mul_overflow(max_points, columns, &voxel_elements), "voxelize_hard: max_points times ", columns,
-             " columns must fit int64, got ", max_points);
+  PRED_CHECK(!__builtin_mul_overflow(max_points, columns, &voxel_elements),
+             "voxelize_hard: max_points must be less than 2^63 / C with C=", columns, ", got ", max_points);
   const VoxelizeHardArgs<M, Item> a{sorted.items.get(), sorted.count, in.bits, storage<M>(points), columns, max_points};
   int64_t* slot_of = point_to_slot.mutable_data_ptr<int64_t>();
 

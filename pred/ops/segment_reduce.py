@@ -77,7 +77,7 @@ def _arguments(features: Tensor, index: Tensor, num_segments: int, reduce: str) 
     check_shape(op, "index", index, (features.shape[0],), " as features")
     check_dtype(op, "features", features, FLOATING + HALF)
     check_dtype(op, "index", index, (torch.int64,))
-    check_choice(op, "reduce", reduce, ("sum", "mean", "max"))
+    check_choice(op, "reduce", reduce, tuple(_SAVED_DIMS))
     if index.device != features.device:
         raise ValueError(f"{op}: index must be on the device of features ({features.device}), got {index.device}")
     check_count(op, "num_segments", num_segments)
@@ -106,14 +106,14 @@ def _check_index(index: Tensor, num_segments: int) -> None:
         )
 
 
-def _saved_shape(reduce: str, num_segments: int, channels: int) -> tuple[int, ...]:
-    """Beside the result the kernel returns what the derivative needs: row counts (mean), winning rows (max)."""
-    return {"sum": (0,), "mean": (num_segments,), "max": (num_segments, channels)}[reduce]
+_SAVED_DIMS = {"sum": 0, "mean": 1, "max": 2}
+"""Beside the result the kernel returns what the derivative needs: row counts (mean), winning rows (max)."""
 
 
 def _fake(features: Tensor, index: Tensor, num_segments: int, reduce: str) -> tuple[Tensor, Tensor]:
     channels = features.shape[1]
-    saved = index.new_empty(_saved_shape(reduce, num_segments, channels), dtype=torch.int32)
+    check_choice("segment_reduce", "reduce", reduce, tuple(_SAVED_DIMS))
+    saved = index.new_empty((num_segments, channels)[: _SAVED_DIMS[reduce]] or (0,), dtype=torch.int32)
     return features.new_empty(num_segments, channels), saved
 
 

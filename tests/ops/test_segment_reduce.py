@@ -230,6 +230,12 @@ def test_errors(backend: str) -> None:
                 segment_reduce(features, index, 12)
 
 
+def test_direct_calls_with_meta_tensors_are_checked(native: None) -> None:
+    features, index = torch.empty(5, 3, device="meta"), torch.empty(5, dtype=torch.int64, device="meta")
+    with pytest.raises(ValueError, match="segment_reduce: reduce must be one of sum, mean, max, got 'zeros'"):
+        torch.ops.pred.segment_reduce(features, index, 4, "zeros")
+
+
 def test_direct_calls_are_checked(native: None) -> None:
     features, index = case()
     backward = torch.ops.pred.segment_reduce_backward
