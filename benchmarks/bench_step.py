@@ -42,8 +42,9 @@ from benchmarks.memory import added_peak_bytes
 from benchmarks.phases import compiled
 from benchmarks.report import Row, Target
 from pred.losses import LossConfig, depth_loss, eikonal_loss, semantic_loss
-from pred.models.field import FieldConfig, FieldDecoder, FieldOutput
+from pred.models.field import FieldConfig, FieldDecoder
 from pred.models.renderer import Renderer, RendererConfig, Sharpness
+from pred.ops import DecodedField
 
 LOSS_TOLERANCE = 1e-4
 GRADIENT_TOLERANCE = 1e-3
@@ -62,12 +63,14 @@ class PlainField(FieldDecoder):
 
     def decode(
         self, projected: Tensor, points_m: Tensor, with_gradient: bool = False, semantics: bool = True
-    ) -> FieldOutput:
+    ) -> DecodedField:
         """As `FieldDecoder.decode`, from the map."""
         points_m = points_m.detach().requires_grad_(with_gradient)
-        position = (points_m - self.range_centre_m) / self.range_half_extent_m
+        low, high = torch.tensor(self.point_range).view(2, 3)
+        position = (points_m - (low + high) / 2) / ((high - low) / 2)
         features = F.grid_sample(projected, position[:, None, :, :2], align_corners=False)[:, :, 0].transpose(1, 2)
-        angles = (position[..., None, :] * self.frequencies[:, None]).flatten(-2)
+        octaves = 2.0 ** torch.arange(self.config.frequencies)
+        angles = (position[..., None, :] * octaves[:, None]).flatten(-2)
         activation = torch.cat([features, position, angles.sin(), angles.cos()], dim=-1)
         *hidden_layers, output_layer = self.layers
         assert isinstance(output_layer, torch.nn.Linear)
@@ -79,7 +82,7 @@ class PlainField(FieldDecoder):
         gradient = None
         if with_gradient:
             (gradient,) = torch.autograd.grad(sdf.sum(), points_m, create_graph=True)
-        return FieldOutput(sdf, output[..., 1:] if semantics else None, gradient)
+        return DecodedField(sdf, output[..., 1:] if semantics else None, gradient)
 
 
 class Rays:

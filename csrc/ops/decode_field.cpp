@@ -91,8 +91,7 @@ struct Field {
       PRED_CHECK(fits, op, ": widths must be those of projected in hidden layers, and positive, got ", widths[l + 1]);
       expected += widths[l + 1] * (widths[l] + 1);
     }
-    PRED_CHECK(width >= 16 && width <= 512 && width % 16 == 0, op,
-               ": projected must have a multiple of 16 channels, from 16 to 512, got ", width);
+    PRED_CHECK(width >= 1 && width <= 4096, op, ": projected must have 1 to 4096 channels, got ", width);
     PRED_CHECK(parameters_in.size(0) == expected, op, ": parameters must have ", expected, " elements, got ",
                parameters_in.size(0));
     PRED_CHECK(point_range.size() == 6, op, ": point_range must hold 6 numbers, got ", point_range.size());

@@ -15,6 +15,7 @@ from torch import Tensor
 from pred.losses import eikonal_loss
 from pred.models.field import FieldConfig, FieldDecoder
 from pred.ops import sample_bev
+from pred.ops.decode_field import encode
 
 RANGE = (-8.0, -4.0, -1.0, 8.0, 4.0, 3.0)
 CENTRE = torch.tensor([0.0, 0.0, 1.0])
@@ -68,9 +69,8 @@ def test_sizes_of_the_default() -> None:
 
 
 def test_encoding_by_hand() -> None:
-    field, _, _ = make()
     a, b, c = 0.5, -1.0, 0.25
-    encoding = field._encode(torch.tensor([a, b, c], dtype=torch.float64))
+    encoding = encode(torch.tensor([a, b, c], dtype=torch.float64), 2)
     expected = [a, b, c]
     expected += [math.sin(x) for x in (a, b, c)] + [math.sin(2 * x) for x in (a, b, c)]
     expected += [math.cos(x) for x in (a, b, c)] + [math.cos(2 * x) for x in (a, b, c)]
