@@ -191,35 +191,6 @@ def test_unsorted_and_outlying_u_touch_no_foreign_memory(backend: str) -> None:
     assert (out >= t[:, :1]).all() and (out <= t[:, -1:]).all()
 
 
-def test_carries_no_gradient(backend: str) -> None:
-    t, weights = (tensor.requires_grad_() for tensor in case())
-    assert not resample_rays(t, weights, 5).requires_grad
-
-
-@pytest.mark.parametrize("mode", ["exact", "neus", "nerfstudio"])
-@pytest.mark.parametrize("num_rays", [0, 3])
-def test_opcheck(native: None, num_rays: int, mode: str) -> None:
-    t, weights = case(num_rays, 10, torch.float32)
-    u = (torch.arange(5) + 0.5) / 5
-    torch.library.opcheck(torch.ops.pred.resample_rays.default, (t, weights, u, mode, 0.01, 1e-5, 0.0))
-    assert resample_rays(t, weights, 5).shape == (num_rays, 15)
-
-
-def test_compiles_to_one_graph(backend: str) -> None:
-    t, weights = case()
-    compiled = torch.compile(lambda a, b: resample_rays(a, b, 7), fullgraph=True, backend="aot_eager")
-    assert_close(compiled(t, weights), resample_rays(t, weights, 7), 1e-13)
-
-
-def test_bitwise_equal_for_any_thread_count(native: None) -> None:
-    t, weights = case(500, 96, torch.float32)
-    found = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
-        found.append(resample_rays(t, weights, 128))
-    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
-
-
 def test_errors(backend: str) -> None:
     t, weights = case()
     with pytest.raises(

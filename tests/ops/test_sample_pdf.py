@@ -276,49 +276,6 @@ def test_published_resampling(backend: str) -> None:
 # --- as an op --------------------------------------------------------------------------------------------------------
 
 
-def test_carries_no_gradient(backend: str) -> None:
-    edges, weights = (tensor.requires_grad_() for tensor in case())
-    assert not sample_pdf(edges, weights, 5).requires_grad
-
-
-@pytest.mark.parametrize("mode", ["exact", "neus", "nerfstudio"])
-@pytest.mark.parametrize("num_rays", [0, 3])
-def test_opcheck(native: None, num_rays: int, mode: str) -> None:
-    edges, weights = case(num_rays, 10, torch.float32)
-    u = (torch.arange(5) + 0.5) / 5
-    torch.library.opcheck(torch.ops.pred.sample_pdf.default, (edges, weights, u, mode, 0.01, 1e-5, 0.0))
-    assert sample_pdf(edges, weights, 5, mode=mode).shape == (num_rays, 5)
-
-
-@pytest.mark.parametrize("name", RULES)
-def test_one_graph_for_any_size(backend: str, name: str) -> None:
-    """Changing numbers of rays, edges and samples cost at most two compilations."""
-    counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
-    torch._dynamo.reset()
-
-    def both(edges: Tensor, weights: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        merged = resample_rays(edges, weights, u.shape[1], u, **RULES[name])
-        return call(name, edges, weights, u=u), merged
-
-    compiled = torch.compile(both, fullgraph=True, backend=counter)
-    for rays, edges, n in ((6, 24, 7), (9, 30, 12), (7, 17, 8), (12, 40, 9), (5, 26, 30)):
-        inputs = (*case(rays, edges), torch.rand(rays, n, generator=torch.Generator().manual_seed(n)).double())
-        for actual, expected in zip(compiled(*inputs), both(*inputs), strict=True):
-            assert_close(actual, expected, 1e-13)
-    assert counter.frame_count <= 2
-
-
-@pytest.mark.parametrize("name", RULES)
-def test_bitwise_equal_for_any_thread_count(native: None, name: str) -> None:
-    edges, weights = case(700, 96, torch.float32)
-    found = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
-        found.append((call(name, edges, weights, 128), resample_rays(edges, weights, 128, **RULES[name])))
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
-
-
 @pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
 def test_half_precision_is_widened(backend: str, half: torch.dtype) -> None:
     edges, weights = (tensor.to(half) for tensor in case())
