@@ -347,7 +347,7 @@ _RAYS: dict[str, Any] = {
 }
 # A rounding of the cumulative distribution moves a sample by 1e-7 / weight along its section.
 _PDF: dict[str, Any] = {"order": 0, "tolerance": 20}
-_PDF_MODES = [
+_PDF_MODES: list[Arguments] = [
     {"mode": "exact"},
     {"mode": "neus"},
     {"mode": "nerfstudio"},

@@ -12,7 +12,7 @@ import torch._dynamo.testing
 from torch import Tensor
 
 from pred.ops import reference, resample_rays, sample_pdf
-from tests.tolerances import assert_close
+from tests.tolerances import FORWARD, PLACE, assert_close
 
 UNIPAD: dict[str, Any] = {"mode": "nerfstudio", "histogram_padding": 0.0, "min_width": 1e-5}
 RULES: dict[str, dict[str, Any]] = {
@@ -144,7 +144,7 @@ def test_native_equals_reference(level: str, shape: tuple[int, int, int], name: 
             **RULES[name],
         )
         assert actual.dtype == dtype
-        assert_close(actual.double(), expected, 2e-5 if dtype == torch.float32 else 1e-11)
+        assert_close(actual.double(), expected, PLACE[dtype])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -153,7 +153,7 @@ def test_exact_agrees_with_resample_rays(backend: str, n: int, dtype: torch.dtyp
     edges, weights = case(20, 96, dtype)
     weights[3], weights[4, ::2] = 0, 0
     merged = torch.cat([edges, sample_pdf(edges, weights, n)], dim=1).sort(dim=1).values
-    assert_close(resample_rays(edges, weights, n), merged, 2e-5 if dtype == torch.float32 else 1e-11)
+    assert_close(resample_rays(edges, weights, n), merged, FORWARD[dtype])
 
 
 # --- by hand ---------------------------------------------------------------------------------------------------------
@@ -248,12 +248,12 @@ def test_bad_values_stay_in_their_ray(backend: str, which: str, name: str, bad: 
         assert torch.equal(samples.isnan(), expected.isnan())
         if which != "weights":
             finite = expected.isfinite()
-            assert_close(samples[finite], expected[finite], 1e-4)
+            assert_close(samples[finite], expected[finite], FORWARD[torch.float32])
 
 
 @pytest.mark.parametrize("name", RULES)
 def test_resample_rays_is_samples_and_sort(level: str, name: str) -> None:
-    for dtype, tolerance in ((torch.float32, 2e-5), (torch.float64, 1e-11)):
+    for dtype in (torch.float32, torch.float64):
         edges, weights = case(37, 40, dtype)
         u = torch.rand(37, 30, generator=torch.Generator().manual_seed(1), dtype=dtype)
         edges[3] = edges[3].flip(0)
@@ -263,14 +263,14 @@ def test_resample_rays_is_samples_and_sort(level: str, name: str) -> None:
             actual = resample_rays(edges, weights, 30, given, **RULES[name])
             if name in PUBLISHED:
                 assert torch.equal(actual[actual.isfinite()], merged[merged.isfinite()])
-            assert_close(actual, merged, tolerance)
+            assert_close(actual, merged, FORWARD[dtype])
 
 
 def test_published_resampling(backend: str) -> None:
     """NeuS: sample_pdf, then cat and sort."""
     z, weights = case(20, 65)
     expected = torch.cat([z, neus(z, weights, positions(z, 16))], dim=1).sort(dim=1).values
-    assert_close(resample_rays(z, weights, 16, mode="neus"), expected, 1e-12)
+    assert_close(resample_rays(z, weights, 16, mode="neus"), expected, FORWARD[torch.float64])
 
 
 # --- as an op --------------------------------------------------------------------------------------------------------

@@ -263,9 +263,8 @@ def test_section_without_epsilon_is_the_papers_formula(backend: str, inv_s: floa
     inputs = sections((31, 37), reach=8 / max(inv_s, 4))
     actual = section_results(ours, inputs, inv_s, cos_anneal, 0.0)
     expected = section_results(published_section, inputs, inv_s, cos_anneal, 0.0)
-    # The quotient loses digits where Phi(s d) is small: 1e-16 / 1e-8 at worst. The closed form does not.
     for name, a, e in zip(NAMES, actual, expected, strict=True):
-        assert_close(a, e, 1e-12 if inv_s < 10 else 1e-9, name)
+        assert_close(a, e, 1e-12, name)
 
 
 @pytest.mark.parametrize("eps", [0.0, 1e-5])
