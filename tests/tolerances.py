@@ -14,6 +14,13 @@ PLACE = {torch.float32: 5e-6, torch.float64: 1e-13}
 moves them by rounding / p of the section."""
 
 
+def of_rounded_distances(before: float, after: float, inv_s: float, dtype: torch.dtype) -> float:
+    """Relative error of the opacity between two signed distances, and of its derivatives, that their rounding makes: it
+    changes exp(s (after - before)) by s times as much, and 1 - exp() by its share in their difference."""
+    eps, difference = torch.finfo(dtype).eps, abs(before - after) or 1.0
+    return 8 * eps + eps * max(abs(before), abs(after)) * (inv_s + 1 / difference)
+
+
 def relative_error(actual: Tensor, expected: Tensor) -> float:
     """Largest difference over the largest expected magnitude (at least 1e-30); inf where NaNs do not coincide."""
     if actual.shape != expected.shape:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pred.ops import Composite, composite_rays, reference
-from tests.tolerances import FORWARD, GRADIENT, assert_close
+from tests.tolerances import FORWARD, GRADIENT, assert_close, of_rounded_distances
 
 OUTPUTS = ("weights", "depth", "opacity", "values")
 INPUTS = ("sdf", "inv_s", "t", "values")
@@ -152,10 +152,7 @@ def test_two_samples(backend: str, name: str, dtype: torch.dtype) -> None:
     before, after, inv_s, opacity, grad_before, grad_after = TWO_SAMPLES[name]
     sdf = torch.tensor([[before, after]], dtype=dtype, requires_grad=True)
     out = composite_rays(sdf, inv_s, torch.tensor([[3.0, 5.0]], dtype=dtype))
-    # Both distances are rounded, which changes exp(s (d_1 - d_0)) by s times as much, and 1 - exp() by its share in
-    # their difference.
-    eps, difference = torch.finfo(dtype).eps, abs(before - after) or 1.0
-    rel = 8 * eps + eps * max(abs(before), abs(after)) * (inv_s + 1 / difference)
+    rel = of_rounded_distances(before, after, inv_s, dtype)
     assert out.opacity.item() == pytest.approx(opacity, rel=rel, abs=1e-12)
     assert depth(out).item() == pytest.approx(3 * opacity, rel=rel, abs=1e-12)
     (grad,) = torch.autograd.grad(out.opacity.sum(), sdf)
