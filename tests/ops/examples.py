@@ -347,6 +347,12 @@ _RAYS: dict[str, Any] = {
 }
 # A rounding of the cumulative distribution moves a sample by 1e-7 / weight along its section.
 _PDF: dict[str, Any] = {"order": 0, "tolerance": 20}
+_PDF_MODES: list[Arguments] = [
+    {"mode": "exact"},
+    {"mode": "neus"},
+    {"mode": "nerfstudio"},
+    {"mode": "nerfstudio", "histogram_padding": 0.0, "min_width": 1e-5},
+]
 
 _CLOUDS: dict[str, Any] = {"features": ("points", "queries"), "reference_compiles": False}
 
@@ -424,9 +430,9 @@ EXAMPLES = [
         reference_compiles=False,
         **_RAYS,
     ),
-    *_examples("sample_pdf", _sample_pdf, *({"mode": mode} for mode in ("exact", "neus", "nerfstudio")), **_PDF),
+    *_examples("sample_pdf", _sample_pdf, *_PDF_MODES, **_PDF),
     *_examples("sample_pdf", _sample_pdf, {"u": None}, {"num_samples": None}, **_PDF),
-    *_examples("resample_rays", _resample_rays, *({"mode": mode} for mode in ("exact", "neus", "nerfstudio")), **_PDF),
+    *_examples("resample_rays", _resample_rays, *_PDF_MODES, **_PDF),
     *_examples("resample_rays", _resample_rays, {"u": None}, **_PDF),
 ]
 

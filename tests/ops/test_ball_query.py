@@ -6,8 +6,6 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
-from torch._dynamo.testing import CompileCounterWithBackend
 
 from pred.ops import Ball, ball_query, reference
 from tests.conftest import KERNEL_ERROR
@@ -115,25 +113,6 @@ def test_empty(backend: str, num_points: int, num_queries: int, batch: list[int]
     found = ball_query(points, torch.tensor(batch_offsets), queries, torch.tensor(query_offsets), 9.0, 4)
     assert found.indices.shape == (num_queries, 4) and found.counts.shape == (num_queries,)
     assert (found.indices == -1).all() and not found.counts.any()
-
-
-@pytest.mark.parametrize("num_points", [0, 40])
-def test_opcheck(native: None, num_points: int) -> None:
-    batch = torch.tensor([0, num_points // 2, num_points])
-    arguments = (cloud("normal", num_points), batch, cloud("normal", 9), torch.tensor([0, 3, 9]), 20.0, 5)
-    torch.library.opcheck(torch.ops.pred.ball_query.default, arguments)
-
-
-def test_compiles_to_one_graph(native: None) -> None:
-    def crowd(points: Tensor, batch: Tensor) -> Tensor:
-        return ball_query(points, batch, points, batch, 9.0, 4).counts.sum()
-
-    counter = CompileCounterWithBackend("aot_eager")
-    compiled = torch.compile(crowd, fullgraph=True, backend=counter)
-    for num_points in (40, 90, 55, 300, 77):
-        points, batch = cloud("normal", num_points), torch.tensor([0, 10, num_points])
-        assert torch.equal(compiled(points, batch), crowd(points, batch))
-    assert counter.frame_count <= 2
 
 
 def test_errors(backend: str) -> None:

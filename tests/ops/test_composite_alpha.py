@@ -124,7 +124,7 @@ def test_neus_in_its_own_words(backend: str) -> None:
     ones = torch.ones(7, 1)
     expected = alpha * torch.cumprod(torch.cat([ones, 1.0 - alpha + 1e-7], dim=-1), dim=-1)[:, :-1]
     out = composite_alpha(alpha, transmittance_eps=1e-7)
-    assert_close(out.weights, expected, 1e-5)  # its product of 96 rounded factors
+    assert_close(out.weights, expected, FORWARD[torch.float32])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -232,17 +232,6 @@ def test_each_gradient_alone(native: None, wanted: str) -> None:
     assert torch.equal(grad, expected)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_levels_agree(level: str, dtype: torch.dtype) -> None:
-    for shape in [(9, 224, 19), (3, 37, 5)]:
-        inputs = case(*shape, dtype=dtype)
-        actual = results(composite_alpha, inputs, transmittance_eps=1e-7)
-        wide = tuple(tensor.double() for tensor in inputs)
-        expected = results(reference.composite_alpha, wide, transmittance_eps=1e-7)
-        for name, value in actual.items():
-            assert_close(value.double(), expected[name], GRADIENT[dtype], name)
-
-
 def test_agrees_with_composite_rays(native: None) -> None:
     """Opacities of signed distances, given to one op or made by the other."""
     t = torch.linspace(1, 20, 64, dtype=torch.float64).expand(5, -1).contiguous()
@@ -259,7 +248,7 @@ def test_agrees_with_composite_rays(native: None) -> None:
         (grad,) = torch.autograd.grad(out.depth.sum() + out.values.square().sum(), sdf)
         found.append((out.weights, out.depth, out.values, grad))
     for fused_result, composed in zip(*found, strict=True):
-        assert_close(fused_result, composed, 1e-11)
+        assert_close(fused_result, composed, GRADIENT[torch.float64])
 
 
 @pytest.mark.parametrize("options", [*OPTIONS.values(), {"normalize_depth": True}], ids=str)
@@ -269,18 +258,13 @@ def test_gradcheck(backend: str, options: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("num_rays", [0, 3])
-def test_opcheck(native: None, num_rays: int) -> None:
-    alpha, t, values = (tensor.float().requires_grad_() for tensor in case(num_rays, 9, 3))
-    op, backward = torch.ops.pred.composite_alpha.default, torch.ops.pred.composite_alpha_backward.default
-    torch.library.opcheck(op, (alpha, t, values, None, 1e-7, False))
-    torch.library.opcheck(op, (alpha, None, None, None, 0.0, True))
-    grads = [torch.randn(num_rays, 9), torch.randn(num_rays), torch.randn(num_rays), torch.randn(num_rays, 3)]
-    plain = [tensor.detach() for tensor in (alpha, t, values)]
-    for needs in [(True, True, True), (False, False, True)]:
-        torch.library.opcheck(backward, (*grads, *plain, None, 1e-7, True, *needs))
-    torch.library.opcheck(
-        backward, (None, None, grads[2], None, plain[0], None, None, None, 0.0, False, True, False, False)
-    )
+def test_opcheck_without_some_gradients(native: None, num_rays: int) -> None:
+    alpha, t, values = (tensor.float() for tensor in case(num_rays, 9, 3))
+    backward = torch.ops.pred.composite_alpha_backward.default
+    of_opacity = (None, None, torch.randn(num_rays), None)
+    torch.library.opcheck(backward, (*of_opacity, alpha, None, None, None, 0.0, False, True, False, False))
+    of_values = (None, None, None, torch.randn(num_rays, 3))
+    torch.library.opcheck(backward, (*of_values, alpha, t, values, None, 1e-7, True, False, False, True))
 
 
 def test_errors(backend: str) -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pred.ops import Composite, composite_rays, reference
-from tests.tolerances import FORWARD, GRADIENT, assert_close
+from tests.tolerances import FORWARD, GRADIENT, assert_close, of_rounded_distances
 
 OUTPUTS = ("weights", "depth", "opacity", "values")
 INPUTS = ("sdf", "inv_s", "t", "values")
@@ -152,10 +152,7 @@ def test_two_samples(backend: str, name: str, dtype: torch.dtype) -> None:
     before, after, inv_s, opacity, grad_before, grad_after = TWO_SAMPLES[name]
     sdf = torch.tensor([[before, after]], dtype=dtype, requires_grad=True)
     out = composite_rays(sdf, inv_s, torch.tensor([[3.0, 5.0]], dtype=dtype))
-    # Both distances are rounded, which changes exp(s (d_1 - d_0)) by s times as much, and 1 - exp() by its share in
-    # their difference.
-    eps, difference = torch.finfo(dtype).eps, abs(before - after) or 1.0
-    rel = 8 * eps + eps * max(abs(before), abs(after)) * (inv_s + 1 / difference)
+    rel = of_rounded_distances(before, after, inv_s, dtype)
     assert out.opacity.item() == pytest.approx(opacity, rel=rel, abs=1e-12)
     assert depth(out).item() == pytest.approx(3 * opacity, rel=rel, abs=1e-12)
     (grad,) = torch.autograd.grad(out.opacity.sum(), sdf)
@@ -278,15 +275,6 @@ def test_each_output_has_its_gradient(native: None, outputs: tuple[str, ...]) ->
         assert_close(value, expected[name], GRADIENT[torch.float64], name)
 
 
-def test_without_values(native: None) -> None:
-    sdf, inv_s, t, _ = case()
-    out, expected = composite_rays(sdf, inv_s, t), reference.composite_rays(sdf, inv_s, t)
-    assert out.values is None and expected.values is None
-    for actual, wanted in zip(out[:3], expected[:3], strict=True):
-        assert actual is not None and wanted is not None
-        assert_close(actual, wanted, FORWARD[torch.float64])
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 7, 8, 9, 15, 16, 17, 31, 40, 64, 65, 130])
 def test_any_number_of_channels(level: str, channels: int, dtype: torch.dtype) -> None:
@@ -298,7 +286,7 @@ def test_any_number_of_channels(level: str, channels: int, dtype: torch.dtype) -
             reference.composite_rays, tuple(tensor.double() for tensor in inputs), ("values",), **options
         )
         for name, value in actual.items():
-            tolerance = 3 * (GRADIENT if name.startswith("grad") else FORWARD)[dtype]
+            tolerance = (GRADIENT if name.startswith("grad") else FORWARD)[dtype]
             assert_close(value.double(), expected[name], tolerance, name)
 
 
@@ -316,14 +304,6 @@ def test_large_gradient_equals_that_of_its_parts(native: None) -> None:
         assert out.values is not None
         (grad,) = torch.autograd.grad((out.values * cotangent[rays]).sum(), part)
         assert torch.equal(grad, whole["grad_values"][rays])
-
-
-def test_levels_agree(level: str) -> None:
-    inputs = case(9, 224, 19, torch.float32)
-    actual = results(composite_rays, inputs)
-    expected = results(reference.composite_rays, tuple(tensor.double() for tensor in inputs))
-    for name, value in actual.items():
-        assert_close(value.double(), expected[name], 1e-5, name)
 
 
 @pytest.mark.parametrize("last", ["zero", "opaque"])
@@ -344,61 +324,21 @@ def test_detached_distance(backend: str) -> None:
     full = composite_rays(sdf, inv_s, t, values)
     assert full.values is not None
     expected = torch.autograd.grad(full.values.sum() + depth(full).sum(), (t, values))
-    assert_close(grads[2], expected[0], 1e-14)
-    assert_close(grads[3], expected[1], 1e-14)
+    assert torch.equal(grads[2], expected[0]) and torch.equal(grads[3], expected[1])
     kept = composite_rays(sdf, inv_s, t, detach_sdf=True, detach_inv_s=False)
     of_sdf, of_inv_s = torch.autograd.grad(depth(kept).sum(), (sdf, inv_s), allow_unused=True)
     assert of_sdf is None and of_inv_s is not None and of_inv_s != 0
 
 
 @pytest.mark.parametrize("num_rays", [0, 3])
-def test_opcheck(native: None, num_rays: int) -> None:
-    sdf, inv_s, t, values = (tensor.float().requires_grad_() for tensor in case(num_rays, 9, 3))
-    torch.library.opcheck(torch.ops.pred.composite_rays.default, (sdf, inv_s, t, values, None, False, False))
-    torch.library.opcheck(torch.ops.pred.composite_rays.default, (sdf, inv_s, t, None, None, True, True))
-    plain = [tensor.detach() for tensor in (sdf, inv_s, t, values)]
-    grads = [torch.randn(num_rays, 9), torch.randn(num_rays), torch.randn(num_rays), torch.randn(num_rays, 3)]
-    weights, _, _, _, remaining = torch.ops.pred.composite_rays(*plain, None, False, False)
-    backward = torch.ops.pred.composite_rays_backward.default
-    for needs in [(True, True, True, True), (False, False, False, True)]:
-        torch.library.opcheck(backward, (*grads, *plain, None, weights, remaining, False, False, *needs))
-    of_depth = (None, grads[1], None, None)
-    torch.library.opcheck(
-        backward, (*of_depth, *plain[:3], None, None, weights, remaining, True, True, True, False, True, False)
-    )
-
-
-def test_further_derivative_is_refused(native: None) -> None:
-    sdf, inv_s, t, values = case()
-    sdf.requires_grad_()
-    (first,) = torch.autograd.grad(depth(composite_rays(sdf, inv_s, t)).sum(), sdf, create_graph=True)
-    with pytest.raises(RuntimeError, match="composite_rays_backward: a further derivative"):
-        first.square().sum().backward()
-
-
-def test_compiles_to_one_graph(backend: str) -> None:
-    inputs = tuple(tensor.requires_grad_() for tensor in case())
-
-    def loss(*x: Tensor) -> Tensor:
-        out = composite_rays(*x)
-        assert out.values is not None
-        return depth(out).sum() + out.values.square().sum()
-
-    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
-    for actual, expected in zip(
-        torch.autograd.grad(compiled(*inputs), inputs), torch.autograd.grad(loss(*inputs), inputs), strict=True
-    ):
-        assert_close(actual, expected, 1e-12)
-
-
-def test_bitwise_equal_for_any_thread_count(native: None) -> None:
-    inputs = case(300, 224, 19, torch.float32)
-    found = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
-        found.append(results(composite_rays, inputs))
-    for other in found[1:]:
-        assert all(torch.equal(value, other[name]) for name, value in found[0].items())
+def test_opcheck_without_some_gradients(native: None, num_rays: int) -> None:
+    sdf, inv_s, t, values = (tensor.float() for tensor in case(num_rays, 9, 3))
+    weights, _, _, _, remaining = torch.ops.pred.composite_rays(sdf, inv_s, t, values, None, False, False)
+    backward, saved = torch.ops.pred.composite_rays_backward.default, (None, weights, remaining)
+    of_depth = (None, torch.randn(num_rays), None, None, sdf, inv_s, t, None)
+    torch.library.opcheck(backward, (*of_depth, *saved, True, True, True, False, True, False))
+    of_values = (None, None, None, torch.randn(num_rays, 3), sdf, inv_s, t, values)
+    torch.library.opcheck(backward, (*of_values, *saved, False, False, False, False, False, True))
 
 
 @pytest.mark.parametrize("which", ["sdf", "t", "values"])
@@ -474,13 +414,3 @@ def test_errors(backend: str) -> None:
         composite_rays(sdf, torch.ones(2, dtype=torch.float64), t)
     with pytest.raises(ValueError, match="composite_rays: inv_s must be finite and not negative"):
         composite_rays(sdf, -1.0, t)
-
-
-def test_autocast_computes_in_float32(backend: str) -> None:
-    sdf, _, t, values = case(dtype=torch.float32)
-    with torch.autocast("cpu", torch.bfloat16):
-        out = composite_rays(sdf, 2.7, t, values.bfloat16())
-    assert out.values is not None and out.values.dtype == torch.float32
-    expected = composite_rays(sdf, 2.7, t, values.bfloat16().float())
-    assert expected.values is not None
-    assert_close(out.values, expected.values, 1e-6)

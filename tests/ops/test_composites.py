@@ -1,6 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""What composite_rays and composite_alpha share: packed rays, half storage, empty input, threads, compilation."""
+"""What composite_rays and composite_alpha share: packed rays, half storage, empty input, threads."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from torch._dynamo.testing import CompileCounterWithBackend
 
 from pred import ops
 from pred.ops import Composite, reference
@@ -126,9 +125,7 @@ def test_packed_equals_ray_by_ray(backend: str, op: str, name: str, channels: in
     assert actual["weights"].shape == (sum(LENGTHS),) and actual["depth"].shape == (len(LENGTHS),)
     for key, value in actual.items():
         assert value.dtype == dtype
-        # The reference computes in float32 and sums logarithms of what is left.
-        slack = 4 if backend == "reference" and dtype == torch.float32 else 1
-        tolerance = slack * (GRADIENT if key.startswith("grad") else FORWARD)[dtype]
+        tolerance = (GRADIENT if key.startswith("grad") else FORWARD)[dtype]
         assert_close(value.double(), expected[key], tolerance, key)
 
 
@@ -138,7 +135,7 @@ def test_packed_depth_can_be_normalized(backend: str, op: str) -> None:
     inputs, offsets = packed_case(op, LENGTHS)
     actual = results(function(op), inputs, ray_offsets=offsets, normalize_depth=True)
     for name, expected in ray_by_ray(op, inputs, offsets, normalize_depth=True).items():
-        assert_close(actual[name], expected, 1e-10, name)
+        assert_close(actual[name], expected, GRADIENT[torch.float64], name)
 
 
 @pytest.mark.parametrize("op", OPS)
@@ -148,14 +145,6 @@ def test_packed_equals_dense_bitwise(native: None, op: str) -> None:
     dense = results(function(op), tuple(tensor.unflatten(0, (11, 37)) for tensor in inputs))
     for name, value in packed.items():
         assert torch.equal(value, dense[name].reshape(value.shape)), name
-
-
-@pytest.mark.parametrize("op", OPS)
-def test_packed_levels_agree(level: str, op: str) -> None:
-    inputs, offsets = packed_case(op, LENGTHS, 5, torch.float32)
-    actual = results(function(op), inputs, ray_offsets=offsets)
-    for name, expected in ray_by_ray(op, inputs, offsets).items():
-        assert_close(actual[name].double(), expected, GRADIENT[torch.float32], name)
 
 
 @pytest.mark.parametrize("op", OPS)
@@ -199,7 +188,7 @@ def test_packed_sharpness_has_its_gradient(backend: str) -> None:
         assert part is not None
         total = total + part.sum()
     (expected,) = torch.autograd.grad(total, inv_s)
-    assert_close(actual, expected, 1e-11)
+    assert_close(actual, expected, GRADIENT[torch.float64])
 
 
 @pytest.mark.parametrize("op", OPS)
@@ -225,28 +214,6 @@ def test_packed_gradcheck(backend: str, op: str) -> None:
     leaves = tuple(tensor.requires_grad_() for tensor in inputs)
     call = function(op)
     assert torch.autograd.gradcheck(lambda *x: tuple(call(*x, ray_offsets=offsets, depth_at="mid")), leaves)
-
-
-def test_packed_opcheck(native: None) -> None:
-    for lengths in ([3, 0, 17], []):
-        (source, t, values), offsets = packed_case("composite_rays", lengths or [0], 3, torch.float32)
-        offsets = offsets if lengths else offsets[:1]
-        leaves = [tensor.requires_grad_() for tensor in (source, t, values)]
-        inv_s = torch.tensor(2.7, requires_grad=True)
-        rays, alpha = torch.ops.pred.composite_rays, torch.ops.pred.composite_alpha
-        torch.library.opcheck(rays.default, (leaves[0], inv_s, leaves[1], leaves[2], offsets, True, False))
-        torch.library.opcheck(alpha.default, (*leaves, offsets, 0.0, False))
-        plain = [leaf.detach() for leaf in leaves]
-        count = offsets.shape[0] - 1
-        grads = [torch.randn(source.shape[0]), torch.randn(count), torch.randn(count), torch.randn(count, 3)]
-        weights, _, _, _, remaining = rays(plain[0], inv_s.detach(), *plain[1:], offsets, True, False)
-        torch.library.opcheck(
-            torch.ops.pred.composite_rays_backward.default,
-            (*grads, plain[0], inv_s.detach(), *plain[1:], offsets, weights, remaining, True, False, *[True] * 4),
-        )
-        torch.library.opcheck(
-            torch.ops.pred.composite_alpha_backward.default, (*grads, *plain, offsets, 0.0, True, *[True] * 3)
-        )
 
 
 @pytest.mark.parametrize("op", OPS)
@@ -331,8 +298,7 @@ def test_half_values(backend: str, op: str, channels: int, half: torch.dtype) ->
     total = (out.weights * torch.cos(place)).sum() - 0.3 * out.depth.sum() + 0.7 * out.opacity.sum()
     grads = torch.autograd.grad([total, out.values], leaves, [torch.ones(()), sine])
     assert torch.equal(actual["grad_values"], grads[2].to(half))
-    assert_close(actual["grad_source"], grads[0], 1e-6)
-    assert_close(actual["grad_t"], grads[1], 1e-6)
+    assert torch.equal(actual["grad_source"], grads[0]) and torch.equal(actual["grad_t"], grads[1])
 
 
 @pytest.mark.parametrize("half", HALF)
@@ -388,73 +354,3 @@ def test_dtypes_that_do_not_mix(backend: str, op: str) -> None:
         function(op)(source.float(), t.float(), values, ray_offsets=offsets)
     with pytest.raises(TypeError, match=f"{op}: {name} must be float32 or float64, got int64"):
         function(op)(source.long(), t, values, ray_offsets=offsets)
-
-
-@pytest.mark.parametrize("op", OPS)
-def test_autocast_computes_in_float32(backend: str, op: str) -> None:
-    (source, t, values), offsets = packed_case(op, LENGTHS, 3, torch.float32)
-    with torch.autocast("cpu", torch.bfloat16):
-        out = function(op)(source, t, values.bfloat16(), ray_offsets=offsets)
-    expected = function(op)(source, t, values.bfloat16().float(), ray_offsets=offsets)
-    assert out.values is not None and expected.values is not None and out.values.dtype == torch.float32
-    assert_close(out.values, expected.values, 1e-6)
-
-
-# --- Derivatives and compilation -----------------------------------------------------------------
-@pytest.mark.parametrize("op", OPS)
-def test_further_derivative_is_refused(native: None, op: str) -> None:
-    (source, t, values), offsets = packed_case(op, [4, 3])
-    source.requires_grad_()
-    out = function(op)(source, t, values, ray_offsets=offsets)
-    assert out.depth is not None
-    (first,) = torch.autograd.grad(out.depth.sum(), source, create_graph=True)
-    with pytest.raises(RuntimeError, match=f"{op}_backward: a further derivative"):
-        first.square().sum().backward()
-
-
-@pytest.mark.parametrize("packed", [False, True], ids=["dense", "packed"])
-@pytest.mark.parametrize("op", OPS)
-def test_sizes_cost_two_compilations(native: None, op: str, packed: bool) -> None:
-    counter = CompileCounterWithBackend("aot_eager")
-    call = function(op)
-
-    def loss(source: Tensor, t: Tensor, values: Tensor, offsets: Tensor | None) -> Tensor:
-        out = call(source, t, values, ray_offsets=offsets)
-        assert out.depth is not None and out.values is not None
-        return out.depth.sum() + out.values.square().sum()
-
-    torch._dynamo.reset()
-    compiled = torch.compile(loss, fullgraph=True, backend=counter)
-    for number in range(5):
-        lengths = [7 + number] * (5 + 2 * number)
-        inputs, offsets = packed_case(op, [*lengths, 3] if packed else lengths, 4)
-        if not packed:
-            inputs = (inputs[0].unflatten(0, (len(lengths), -1)),) + tuple(
-                x.unflatten(0, (len(lengths), -1)) for x in inputs[1:]
-            )
-        leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-        source, t, values = leaves
-        arguments = (source, t, values, offsets if packed else None)
-        actual = torch.autograd.grad(compiled(*arguments), leaves)
-        expected = torch.autograd.grad(loss(*arguments), leaves)
-        for one, other in zip(actual, expected, strict=True):
-            assert_close(one, other, 1e-12)
-    assert counter.frame_count <= 2
-
-
-@pytest.mark.parametrize("op", OPS)
-def test_compiles_to_one_graph(backend: str, op: str) -> None:
-    inputs, _ = packed_case(op, [9] * 4)
-    leaves = [tensor.unflatten(0, (4, 9)).clone().requires_grad_() for tensor in inputs]
-    call = function(op)
-
-    def loss(*x: Tensor) -> Tensor:
-        out = call(*x)
-        assert out.depth is not None and out.values is not None
-        return out.depth.sum() + out.values.square().sum()
-
-    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
-    for one, other in zip(
-        torch.autograd.grad(compiled(*leaves), leaves), torch.autograd.grad(loss(*leaves), leaves), strict=True
-    ):
-        assert_close(one, other, 1e-12)

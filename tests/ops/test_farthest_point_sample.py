@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-from torch._dynamo.testing import CompileCounterWithBackend
 
 from pred.ops import farthest_point_sample, reference
 from tests.conftest import KERNEL_ERROR
@@ -102,28 +101,6 @@ def test_no_points(backend: str, batch: list[int]) -> None:
 
 def test_no_samples(backend: str) -> None:
     assert farthest_point_sample(torch.zeros(5, 3), torch.tensor([0, 5]), 0).shape == (1, 0)
-
-
-def test_output_carries_no_gradient(backend: str) -> None:
-    points = cloud("normal", 50).requires_grad_()
-    assert not farthest_point_sample(points, torch.tensor([0, 50]), 5).requires_grad
-
-
-@pytest.mark.parametrize("num_points", [0, 40])
-def test_opcheck(native: None, num_points: int) -> None:
-    arguments = (cloud("normal", num_points), torch.tensor([0, num_points // 2, num_points]), 7, 1)
-    torch.library.opcheck(torch.ops.pred.farthest_point_sample.default, arguments)
-
-
-def test_compiles_to_one_graph(native: None) -> None:
-    counter = CompileCounterWithBackend("aot_eager")
-    compiled = torch.compile(
-        lambda points, batch: points[farthest_point_sample(points, batch, 6)], fullgraph=True, backend=counter
-    )
-    for num_points in (40, 90, 55, 300, 77):
-        points, batch = cloud("normal", num_points), torch.tensor([0, 10, num_points])
-        assert torch.equal(compiled(points, batch), points[farthest_point_sample(points, batch, 6)])
-    assert counter.frame_count <= 2
 
 
 def test_errors(backend: str) -> None:

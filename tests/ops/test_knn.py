@@ -6,8 +6,6 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
-from torch._dynamo.testing import CompileCounterWithBackend
 
 from pred.ops import Neighbors, knn, reference
 from tests.conftest import KERNEL_ERROR
@@ -125,30 +123,6 @@ def test_empty(backend: str, num_points: int, num_queries: int, batch: list[int]
     )
     assert found.indices.shape == found.squared_distance.shape == (num_queries, 4)
     assert (found.indices == -1).all() and (found.squared_distance == math.inf).all()
-
-
-def test_outputs_carry_no_gradient(backend: str) -> None:
-    points, batch = cloud("normal", 50).requires_grad_(), torch.tensor([0, 50])
-    assert not any(output.requires_grad for output in knn(points, batch, points, batch, 5))
-
-
-@pytest.mark.parametrize("num_points", [0, 40])
-def test_opcheck(native: None, num_points: int) -> None:
-    batch = torch.tensor([0, num_points // 2, num_points])
-    arguments = (cloud("normal", num_points), batch, cloud("normal", 9), torch.tensor([0, 3, 9]), 5)
-    torch.library.opcheck(torch.ops.pred.knn.default, arguments)
-
-
-def test_compiles_to_one_graph(native: None) -> None:
-    def spread(points: Tensor, batch: Tensor) -> Tensor:
-        return knn(points, batch, points, batch, 4).squared_distance.sum(dim=1)
-
-    counter = CompileCounterWithBackend("aot_eager")
-    compiled = torch.compile(spread, fullgraph=True, backend=counter)
-    for num_points in (40, 90, 55, 300, 77):
-        points, batch = cloud("normal", num_points), torch.tensor([0, 10, num_points])
-        assert torch.equal(compiled(points, batch), spread(points, batch))
-    assert counter.frame_count <= 2
 
 
 def test_errors(backend: str) -> None:

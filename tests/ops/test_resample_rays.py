@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from pred.ops import reference, resample_rays
-from tests.tolerances import assert_close
+from tests.tolerances import FORWARD, PLACE, assert_close
 
 
 def case(num_rays: int = 6, samples: int = 24, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
@@ -85,7 +85,7 @@ def test_native_equals_reference(native: None, shape: tuple[int, int, int], dtyp
     expected = reference.resample_rays(t.double(), weights.double(), new, u.double() if given else None)
     assert actual.shape == (num_rays, samples + new) and actual.dtype == dtype
     # Where the cdf is flat, a rounding of u or cdf moves a sample along the section: as far as 1e-7 / weight.
-    assert_close(actual.double(), expected, 2e-5 if dtype == torch.float32 else 1e-11)
+    assert_close(actual.double(), expected, 1e-5 if dtype == torch.float32 else 1e-12)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -109,7 +109,7 @@ def test_levels_agree(level: str, shape: tuple[int, int, int], spread: str, dtyp
     actual = resample_rays(t.to(dtype), weights.to(dtype), new, u.to(dtype))
     expected = reference.resample_rays(t, weights, new, u)
     assert (actual.diff(dim=1) >= 0).all()
-    assert_close(actual.double(), expected, 2e-5 if dtype == torch.float32 else 1e-12)
+    assert_close(actual.double(), expected, PLACE[dtype])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -159,7 +159,7 @@ def test_nan_stays_in_its_ray(backend: str, which: str) -> None:
 def test_order_of_u_does_not_matter(backend: str, dtype: torch.dtype) -> None:
     t, weights = case(5, 40, dtype)
     u = torch.rand(5, 30, generator=torch.Generator().manual_seed(1), dtype=dtype)
-    assert_close(resample_rays(t, weights, 30, u), resample_rays(t, weights, 30, u.sort(dim=1).values), 1e-6)
+    assert_close(resample_rays(t, weights, 30, u), resample_rays(t, weights, 30, u.sort(dim=1).values), FORWARD[dtype])
 
 
 @pytest.mark.parametrize("kind", ["t descends", "t is infinite", "t is NaN", "u is NaN", "all are NaN"])
@@ -180,7 +180,7 @@ def test_any_input_gives_a_sorted_row(backend: str, kind: str) -> None:
     assert torch.equal(out.isnan(), expected.isnan())
     assert (out.diff(dim=1) >= 0).logical_or(out[:, 1:].isnan()).logical_or(out[:, 1:] == torch.inf).all()
     finite = expected.isfinite()
-    assert_close(out[finite], expected[finite], 1e-4)
+    assert_close(out[finite], expected[finite], FORWARD[torch.float32])
 
 
 def test_unsorted_and_outlying_u_touch_no_foreign_memory(backend: str) -> None:
@@ -191,41 +191,12 @@ def test_unsorted_and_outlying_u_touch_no_foreign_memory(backend: str) -> None:
     assert (out >= t[:, :1]).all() and (out <= t[:, -1:]).all()
 
 
-def test_carries_no_gradient(backend: str) -> None:
-    t, weights = (tensor.requires_grad_() for tensor in case())
-    assert not resample_rays(t, weights, 5).requires_grad
-
-
-@pytest.mark.parametrize("mode", ["exact", "neus", "nerfstudio"])
-@pytest.mark.parametrize("num_rays", [0, 3])
-def test_opcheck(native: None, num_rays: int, mode: str) -> None:
-    t, weights = case(num_rays, 10, torch.float32)
-    u = (torch.arange(5) + 0.5) / 5
-    torch.library.opcheck(torch.ops.pred.resample_rays.default, (t, weights, u, mode, 0.01, 1e-5, 0.0))
-    assert resample_rays(t, weights, 5).shape == (num_rays, 15)
-
-
-def test_compiles_to_one_graph(backend: str) -> None:
-    t, weights = case()
-    compiled = torch.compile(lambda a, b: resample_rays(a, b, 7), fullgraph=True, backend="aot_eager")
-    assert_close(compiled(t, weights), resample_rays(t, weights, 7), 1e-13)
-
-
 def test_no_sample_is_lost_where_a_slope_overflows(level: str) -> None:
     t = torch.tensor([[0.0, 3e38, 3.1e38]])
     merged = resample_rays(t, torch.tensor([[3e-30, 1.0]]), 4)
     # All new samples lie in the second section; the old ones stand around them.
     assert merged[0, 0] == 0 and merged[0, 1] == t[0, 1] and merged[0, -1] == t[0, 2]
     assert merged.isfinite().all() and (merged.diff() >= 0).all()
-
-
-def test_bitwise_equal_for_any_thread_count(native: None) -> None:
-    t, weights = case(500, 96, torch.float32)
-    found = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
-        found.append(resample_rays(t, weights, 128))
-    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
 
 
 def test_errors(backend: str) -> None:

@@ -12,7 +12,7 @@ import torch._dynamo.testing
 from torch import Tensor
 
 from pred.ops import reference, resample_rays, sample_pdf
-from tests.tolerances import assert_close
+from tests.tolerances import FORWARD, PLACE, assert_close
 
 UNIPAD: dict[str, Any] = {"mode": "nerfstudio", "histogram_padding": 0.0, "min_width": 1e-5}
 RULES: dict[str, dict[str, Any]] = {
@@ -144,7 +144,7 @@ def test_native_equals_reference(level: str, shape: tuple[int, int, int], name: 
             **RULES[name],
         )
         assert actual.dtype == dtype
-        assert_close(actual.double(), expected, 2e-5 if dtype == torch.float32 else 1e-11)
+        assert_close(actual.double(), expected, PLACE[dtype])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -153,7 +153,7 @@ def test_exact_agrees_with_resample_rays(backend: str, n: int, dtype: torch.dtyp
     edges, weights = case(20, 96, dtype)
     weights[3], weights[4, ::2] = 0, 0
     merged = torch.cat([edges, sample_pdf(edges, weights, n)], dim=1).sort(dim=1).values
-    assert_close(resample_rays(edges, weights, n), merged, 2e-5 if dtype == torch.float32 else 1e-11)
+    assert_close(resample_rays(edges, weights, n), merged, FORWARD[dtype])
 
 
 # --- by hand ---------------------------------------------------------------------------------------------------------
@@ -248,12 +248,12 @@ def test_bad_values_stay_in_their_ray(backend: str, which: str, name: str, bad: 
         assert torch.equal(samples.isnan(), expected.isnan())
         if which != "weights":
             finite = expected.isfinite()
-            assert_close(samples[finite], expected[finite], 1e-4)
+            assert_close(samples[finite], expected[finite], FORWARD[torch.float32])
 
 
 @pytest.mark.parametrize("name", RULES)
 def test_resample_rays_is_samples_and_sort(level: str, name: str) -> None:
-    for dtype, tolerance in ((torch.float32, 2e-5), (torch.float64, 1e-11)):
+    for dtype in (torch.float32, torch.float64):
         edges, weights = case(37, 40, dtype)
         u = torch.rand(37, 30, generator=torch.Generator().manual_seed(1), dtype=dtype)
         edges[3] = edges[3].flip(0)
@@ -263,60 +263,17 @@ def test_resample_rays_is_samples_and_sort(level: str, name: str) -> None:
             actual = resample_rays(edges, weights, 30, given, **RULES[name])
             if name in PUBLISHED:
                 assert torch.equal(actual[actual.isfinite()], merged[merged.isfinite()])
-            assert_close(actual, merged, tolerance)
+            assert_close(actual, merged, FORWARD[dtype])
 
 
 def test_published_resampling(backend: str) -> None:
     """NeuS: sample_pdf, then cat and sort."""
     z, weights = case(20, 65)
     expected = torch.cat([z, neus(z, weights, positions(z, 16))], dim=1).sort(dim=1).values
-    assert_close(resample_rays(z, weights, 16, mode="neus"), expected, 1e-12)
+    assert_close(resample_rays(z, weights, 16, mode="neus"), expected, FORWARD[torch.float64])
 
 
 # --- as an op --------------------------------------------------------------------------------------------------------
-
-
-def test_carries_no_gradient(backend: str) -> None:
-    edges, weights = (tensor.requires_grad_() for tensor in case())
-    assert not sample_pdf(edges, weights, 5).requires_grad
-
-
-@pytest.mark.parametrize("mode", ["exact", "neus", "nerfstudio"])
-@pytest.mark.parametrize("num_rays", [0, 3])
-def test_opcheck(native: None, num_rays: int, mode: str) -> None:
-    edges, weights = case(num_rays, 10, torch.float32)
-    u = (torch.arange(5) + 0.5) / 5
-    torch.library.opcheck(torch.ops.pred.sample_pdf.default, (edges, weights, u, mode, 0.01, 1e-5, 0.0))
-    assert sample_pdf(edges, weights, 5, mode=mode).shape == (num_rays, 5)
-
-
-@pytest.mark.parametrize("name", RULES)
-def test_one_graph_for_any_size(backend: str, name: str) -> None:
-    """Changing numbers of rays, edges and samples cost at most two compilations."""
-    counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
-    torch._dynamo.reset()
-
-    def both(edges: Tensor, weights: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        merged = resample_rays(edges, weights, u.shape[1], u, **RULES[name])
-        return call(name, edges, weights, u=u), merged
-
-    compiled = torch.compile(both, fullgraph=True, backend=counter)
-    for rays, edges, n in ((6, 24, 7), (9, 30, 12), (7, 17, 8), (12, 40, 9), (5, 26, 30)):
-        inputs = (*case(rays, edges), torch.rand(rays, n, generator=torch.Generator().manual_seed(n)).double())
-        for actual, expected in zip(compiled(*inputs), both(*inputs), strict=True):
-            assert_close(actual, expected, 1e-13)
-    assert counter.frame_count <= 2
-
-
-@pytest.mark.parametrize("name", RULES)
-def test_bitwise_equal_for_any_thread_count(native: None, name: str) -> None:
-    edges, weights = case(700, 96, torch.float32)
-    found = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
-        found.append((call(name, edges, weights, 128), resample_rays(edges, weights, 128, **RULES[name])))
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
 
 @pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])

@@ -14,7 +14,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch._dynamo.testing import CompileCounterWithBackend
 
 from pred import ops
 from pred.ops import reference, sample_bev, sample_bev_with_grad, sample_volume, sample_volume_with_grad
@@ -171,7 +170,7 @@ def test_equals_grid_sample(backend: str, sampler: Sampler, size: int, padding: 
     actual = gradients(lambda m, g: sampler.call()(m, g, padding, align), volume, grid, second_order=True)
     expected = gradients(lambda m, g: grid_sample(m, g, padding, align), volume, grid, second_order=True)
     for a, e in zip(actual, expected, strict=True):
-        assert_close(a, e, 1e-9)
+        assert_close(a, e, GRADIENT[torch.float64])
     if samples == 0:
         return
 
@@ -183,7 +182,7 @@ def test_equals_grid_sample(backend: str, sampler: Sampler, size: int, padding: 
     actual = gradients_with_grad(lambda m, g: sampler.call("_with_grad")(m, g, padding, align), volume, grid)
     expected = gradients_with_grad(values_and_slopes, volume, grid)
     for a, e in zip(actual, expected, strict=True):
-        assert_close(a, e, 1e-9)
+        assert_close(a, e, GRADIENT[torch.float64])
 
 
 @pytest.mark.parametrize("padding,align", MODES)
@@ -208,17 +207,6 @@ def test_native_equals_reference(
         assert_close(a.double(), e, tolerance, f"result {number}")
 
 
-@pytest.mark.parametrize("channels", [1, 3, 37])
-def test_levels_agree(level: str, sampler: Sampler, channels: int) -> None:
-    volume, grid = case((2, channels, *(11, 13, 4)[: sampler.axes]), 400, torch.float32)
-    actual = gradients(sampler.call(), volume, grid, second_order=True)
-    expected = gradients(sampler.call(of=reference), volume.double(), grid.double(), second_order=True)
-    actual += gradients_with_grad(sampler.call("_with_grad"), volume, grid)
-    expected += gradients_with_grad(sampler.call("_with_grad", reference), volume.double(), grid.double())
-    for a, e in zip(actual, expected, strict=True):
-        assert_close(a.double(), e, 4e-5)
-
-
 @pytest.mark.parametrize("padding,align", MODES)
 def test_gradcheck(backend: str, sampler: Sampler, padding: str, align: bool) -> None:
     torch.set_num_threads(1)  # thousands of tiny calls
@@ -228,18 +216,6 @@ def test_gradcheck(backend: str, sampler: Sampler, padding: str, align: bool) ->
     assert torch.autograd.gradcheck(
         lambda m, g: tuple(sampler.call("_with_grad")(m, g, padding, align)), (volume, grid)
     )
-
-
-def test_further_derivatives_are_refused(native: None, sampler: Sampler) -> None:
-    volume, grid = (tensor.requires_grad_() for tensor in case(sampler.small, samples=3))
-    first = torch.autograd.grad(sampler.call()(volume, grid).square().sum(), grid, create_graph=True)[0]
-    second = torch.autograd.grad(first.square().sum(), grid, create_graph=True)[0]
-    with pytest.raises(RuntimeError, match=f"{sampler.op}_double_backward: a further derivative is not supported"):
-        torch.autograd.grad(second.square().sum(), grid)
-    sampled = sampler.call("_with_grad")(volume, grid)
-    first = torch.autograd.grad(sampled.grads.square().sum(), volume, create_graph=True)[0]
-    with pytest.raises(RuntimeError, match=f"{sampler.op}_with_grad_backward: a further derivative is not supported"):
-        torch.autograd.grad(first.square().sum(), grid)
 
 
 def test_gradients_that_nobody_needs_are_not_computed(native: None, sampler: Sampler) -> None:
@@ -280,37 +256,6 @@ def test_opcheck(native: None, sampler: Sampler, samples: int, dtype: torch.dtyp
         torch.library.opcheck(sampler.native("_double_backward"), arguments)
     for some in [(grad, grads), (None, grads), (grad, None)]:
         torch.library.opcheck(sampler.native("_with_grad_backward"), (*some, volume, grid, False, False, True, True))
-
-
-def test_compiles_to_one_graph(backend: str, sampler: Sampler) -> None:
-    volume, grid = (tensor.requires_grad_() for tensor in case(sampler.small))
-
-    def loss(volume: Tensor, grid: Tensor) -> Tensor:
-        values, grads = sampler.call("_with_grad")(volume, grid)
-        eikonal = (grads.mean(dim=-1).square().sum(dim=-1).sqrt() - 1).square()
-        return sampler.call()(volume, grid).sin().sum() + values.cos().sum() + eikonal.sum()
-
-    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
-    actual = torch.autograd.grad(compiled(volume, grid), (volume, grid))
-    expected = torch.autograd.grad(loss(volume, grid), (volume, grid))
-    for a, e in zip(actual, expected, strict=True):
-        assert_close(a, e, 1e-14)
-
-
-def test_changing_numbers_of_samples_compile_twice_at_most(native: None, sampler: Sampler) -> None:
-    torch._dynamo.reset()
-    counter = CompileCounterWithBackend("aot_eager")
-
-    @torch.compile(fullgraph=True, backend=counter)
-    def loss(volume: Tensor, grid: Tensor) -> Tensor:
-        values, grads = sampler.call("_with_grad")(volume, grid)
-        return sampler.call()(volume, grid).sin().sum() + values.sum() + grads.square().sum()
-
-    for samples in (5, 8, 13, 21, 34):
-        volume, grid = (tensor.requires_grad_() for tensor in case(sampler.small, samples))
-        loss(volume, grid).backward()
-        assert grid.grad is not None and grid.grad.shape == grid.shape
-    assert counter.frame_count <= 2
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
@@ -535,12 +480,3 @@ def test_direct_calls_are_checked(native: None, sampler: Sampler) -> None:
         sampler.native("_with_grad_backward")(None, volume[0, 0], volume, grid, False, False, True, True)
     with pytest.raises(KERNEL_ERROR, match=f"{sampler.op}_with_grad_backward: one gradient must be given"):
         sampler.native("_with_grad_backward")(None, None, volume, grid, False, False, True, True)
-
-
-def test_autocast_computes_in_float32(backend: str, sampler: Sampler) -> None:
-    volume, grid = case(sampler.small, dtype=torch.float32)
-    with torch.autocast("cpu", torch.bfloat16):
-        out = sampler.call()(volume.bfloat16(), grid)
-        values, grads = sampler.call("_with_grad")(volume.bfloat16(), grid)
-    assert out.dtype == values.dtype == grads.dtype == torch.float32
-    assert_close(out, sampler.call()(volume.bfloat16().float(), grid), 1e-6)

@@ -12,7 +12,7 @@ import torch._dynamo.testing
 from torch import Tensor
 
 from pred.ops import reference, sdf_to_alpha
-from tests.tolerances import FORWARD, GRADIENT, assert_close
+from tests.tolerances import FORWARD, GRADIENT, assert_close, of_rounded_distances
 
 
 def sigmoid(x: float) -> float:
@@ -26,15 +26,29 @@ def rays(num_rays: int = 7, samples: int = 33, dtype: torch.dtype = torch.float6
     return (2 - steps.cumsum(dim=1) * 0.3 - 0.1 * torch.arange(samples)).to(dtype)
 
 
-# (d_i, d_i+1, s, alpha, d alpha / d d_i, d alpha / d d_i+1), by the definition with Phi(d) = sigmoid(s d) and, where
-# that is 0 / 0 in floating point, by its limit 1 - exp(s (d_i+1 - d_i)).
+# (d_i, d_i+1, s, alpha, d alpha / d d_i, d alpha / d d_i+1), by the definition 1 - Phi(d_i+1) / Phi(d_i), derivatives
+# s ratio (1 - Phi) of either end, and, where that is 0 / 0 in floating point, by its limit 1 - exp(s (d_i+1 - d_i)).
 CASES = {
-    "crossing": (1.0, -1.0, 1.0, 1 - math.exp(-1), 0.26894142 * 0.19661193 / 0.73105858**2, -0.26894142),
-    "deep inside, falling": (-2.0, -2.1, 64.0, 0.9983384, 0.1063388, -0.1063388),
+    "crossing": (1.0, -1.0, 1.0, 1 - math.exp(-1), math.exp(-1) * sigmoid(-1), -sigmoid(-1)),
+    "deep inside, falling": (-2.0, -2.1, 64.0, 1 - math.exp(-6.4), 64 * math.exp(-6.4), -64 * math.exp(-6.4)),
     "inside, rising": (-3.0, -2.9, 64.0, 0.0, 0.0, 0.0),
-    "inside, nearly flat": (-1.0, -1.0001, 64.0, 1 - math.exp(-0.0064), 63.5917, -63.5917),
+    "inside, nearly flat": (
+        -1.0,
+        -1.0001,
+        64.0,
+        1 - math.exp(-0.0064),
+        64 * math.exp(-0.0064),
+        -64 * math.exp(-0.0064),
+    ),
     "free space": (10.0, 9.9, 64.0, 0.0, 0.0, 0.0),
-    "small crossing": (0.3, 0.29, 20.0, 5.4715e-4, 20 * sigmoid(-5.8) * math.exp(-0.2), None),
+    "small crossing": (
+        0.3,
+        0.29,
+        20.0,
+        1 - sigmoid(5.8) / sigmoid(6),
+        20 * sigmoid(5.8) / sigmoid(6) * sigmoid(-6),
+        -20 * sigmoid(5.8) / sigmoid(6) * sigmoid(-5.8),
+    ),
     "tie": (0.5, 0.5, 64.0, 0.0, 0.0, 0.0),
     "opaque": (7.8125, -7.8125, 64.0, 1.0, 0.0, 0.0),
 }
@@ -48,13 +62,10 @@ def test_hand_computed(backend: str, name: str, dtype: torch.dtype) -> None:
     out = sdf_to_alpha(sdf, inv_s)
     out.sum().backward()
     assert out[0, 1] == 0
-    # A difference of 1e-4 between float32 numbers near 1 is exact to 6e-4 only.
-    rel = 1e-3 if dtype == torch.float32 and name == "inside, nearly flat" else 3e-5
+    rel = of_rounded_distances(before, after, inv_s, dtype)
     assert out[0, 0].item() == pytest.approx(alpha, rel=rel, abs=1e-12)
     assert sdf.grad is not None
-    assert sdf.grad[0, 0].item() == pytest.approx(grad_before, rel=1e-4, abs=1e-12)
-    if grad_after is not None:
-        assert sdf.grad[0, 1].item() == pytest.approx(grad_after, rel=1e-4, abs=1e-12)
+    assert sdf.grad[0].tolist() == pytest.approx([grad_before, grad_after], rel=rel, abs=1e-12)
 
 
 def test_last_sample(backend: str) -> None:
@@ -128,43 +139,6 @@ def test_empty(backend: str, shape: tuple[int, int]) -> None:
     out.sum().backward()
     assert sdf.grad is not None and sdf.grad.shape == shape and not sdf.grad.any()
     assert inv_s.grad is not None and inv_s.grad == 0
-
-
-@pytest.mark.parametrize("num_rays", [0, 3])
-def test_opcheck(native: None, num_rays: int) -> None:
-    sdf, inv_s = rays(num_rays, 9).float().requires_grad_(), torch.tensor(2.7, requires_grad=True)
-    torch.library.opcheck(torch.ops.pred.sdf_to_alpha.default, (sdf, inv_s, False))
-    arguments = (torch.randn(num_rays, 9), sdf.detach(), inv_s.detach(), True, True)
-    torch.library.opcheck(torch.ops.pred.sdf_to_alpha_backward.default, arguments)
-
-
-def test_further_derivative_is_refused(native: None) -> None:
-    sdf = rays(2, 5).requires_grad_()
-    (first,) = torch.autograd.grad(sdf_to_alpha(sdf, 2.7).sum(), sdf, create_graph=True)
-    with pytest.raises(RuntimeError, match="sdf_to_alpha_backward: a further derivative"):
-        first.square().sum().backward()
-
-
-def test_compiles_to_one_graph(backend: str) -> None:
-    inputs = (rays(3, 20).requires_grad_(), torch.tensor(1.3, dtype=torch.float64, requires_grad=True))
-
-    def loss(sdf: Tensor, inv_s: Tensor) -> Tensor:
-        return sdf_to_alpha(sdf, inv_s).square().sum()
-
-    actual = torch.autograd.grad(torch.compile(loss, fullgraph=True, backend="aot_eager")(*inputs), inputs)
-    for a, e in zip(actual, torch.autograd.grad(loss(*inputs), inputs), strict=True):
-        assert_close(a, e, 1e-13)
-
-
-def test_bitwise_equal_for_any_thread_count(native: None) -> None:
-    found = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
-        sdf, inv_s = rays(700, 97, torch.float32).requires_grad_(), torch.tensor(2.7, requires_grad=True)
-        out = sdf_to_alpha(sdf, inv_s)
-        found.append([out, *torch.autograd.grad(out.square().sum(), (sdf, inv_s))])
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
 
 def test_nan_stays_in_its_ray(backend: str) -> None:
@@ -300,9 +274,8 @@ def test_section_without_epsilon_is_the_papers_formula(backend: str, inv_s: floa
     inputs = sections((31, 37), reach=8 / max(inv_s, 4))
     actual = section_results(ours, inputs, inv_s, cos_anneal, 0.0)
     expected = section_results(published_section, inputs, inv_s, cos_anneal, 0.0)
-    # The quotient loses digits where Phi(s d) is small: 1e-16 / 1e-8 at worst. The closed form does not.
     for name, a, e in zip(NAMES, actual, expected, strict=True):
-        assert_close(a, e, 1e-12 if inv_s < 10 else 1e-9, name)
+        assert_close(a, e, 1e-12, name)
 
 
 @pytest.mark.parametrize("eps", [0.0, 1e-5])
@@ -401,15 +374,6 @@ def test_section_float32_is_accurate_where_it_is_small(level: str, inv_s: float)
     assert ((actual - expected).abs() / expected)[normal].max() <= 1e-6
 
 
-@pytest.mark.parametrize("eps", [0.0, 1e-5])
-def test_section_levels(level: str, eps: float) -> None:
-    inputs = sections((977,), torch.float32, reach=3.0)
-    wide = tuple(tensor.double() for tensor in inputs)
-    actual = section_results(ours, inputs, 2.7, 0.4, eps)
-    for name, a, e in zip(NAMES, actual, section_results(ours_reference, wide, 2.7, 0.4, eps), strict=True):
-        assert_close(a.double(), e, 2 * FORWARD[a.dtype] if name == "alpha" else GRADIENT[a.dtype], name)
-
-
 def test_section_gradcheck(backend: str) -> None:
     sdf, cosine, length = (tensor.requires_grad_() for tensor in sections((4, 5)))
     inv_s = torch.tensor(1.7, dtype=torch.float64, requires_grad=True)
@@ -504,61 +468,6 @@ def test_density_gradcheck(backend: str) -> None:
     assert torch.autograd.gradcheck(lambda d, x: sdf_to_alpha(d, mode="density", section_length=x), (density, length))
 
 
-@pytest.mark.parametrize("count", [0, 9])
-def test_opcheck_of_all_modes(native: None, count: int) -> None:
-    ops = torch.ops.pred
-    sdf, cosine, length = (tensor.requires_grad_() for tensor in sections((count,), torch.float32))
-    fixed, inv_s = sdf.detach(), torch.tensor(2.7, requires_grad=True)
-    offsets, grad = torch.tensor([0, count // 2, count]), torch.randn(count)
-    torch.library.opcheck(ops.sdf_to_alpha.default, (sdf, inv_s, True, offsets))
-    torch.library.opcheck(ops.sdf_to_alpha_backward.default, (grad, fixed, inv_s.detach(), True, True, offsets))
-    for eps in (0.0, 1e-5):
-        torch.library.opcheck(ops.sdf_to_alpha_section.default, (sdf, inv_s, cosine, length, torch.tensor(0.5), eps))
-        arguments = (grad, fixed, inv_s.detach(), cosine.detach(), length.detach(), torch.tensor(0.5), eps, *4 * [True])
-        torch.library.opcheck(ops.sdf_to_alpha_section_backward.default, arguments)
-    torch.library.opcheck(ops.sdf_to_alpha_density.default, (sdf, length))
-    torch.library.opcheck(ops.sdf_to_alpha_density_backward.default, (grad, fixed, length.detach(), True, True))
-
-
-def test_further_derivatives_are_refused(native: None) -> None:
-    sdf, cosine, length = sections((8,))
-    for name in ("section", "density"):
-        leaf = sdf.clone().requires_grad_()
-        alpha = (
-            ours(leaf, torch.tensor(2.7), cosine, length, 1.0, 0.0)
-            if name == "section"
-            else sdf_to_alpha(leaf, mode="density", section_length=length)
-        )
-        (first,) = torch.autograd.grad(alpha.sum(), leaf, create_graph=True)
-        with pytest.raises(RuntimeError, match=f"sdf_to_alpha_{name}_backward: a further derivative"):
-            first.square().sum().backward()
-
-
-def test_modes_compile_to_one_graph_for_any_size(backend: str) -> None:
-    """Changing numbers of rays and samples cost at most two compilations."""
-    counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
-
-    def loss(sdf: Tensor, cosine: Tensor, length: Tensor, offsets: Tensor) -> Tensor:
-        scale = sdf.new_full((), 2.7)
-        parts = [
-            ours(sdf, scale, cosine, length, 0.3, 0.0),
-            ours(sdf, scale, cosine, length, 0.3, 1e-5),
-            sdf_to_alpha(sdf.abs(), mode="density", section_length=length),
-            sdf_to_alpha(sdf, scale, ray_offsets=offsets),
-        ]
-        return torch.stack(parts).square().sum()
-
-    torch._dynamo.reset()
-    compiled = torch.compile(loss, fullgraph=True, backend=counter)
-    for count in (40, 23, 64, 31, 50):
-        sdf, cosine, length = inputs = tuple(tensor.requires_grad_() for tensor in sections((count,)))
-        offsets = torch.tensor([0, 3, count // 2, count])
-        actual = torch.autograd.grad(compiled(sdf, cosine, length, offsets), inputs)
-        for a, e in zip(actual, torch.autograd.grad(loss(sdf, cosine, length, offsets), inputs), strict=True):
-            assert_close(a, e, 1e-12)
-    assert counter.frame_count <= 2
-
-
 def test_annealing_does_not_compile_again(native: None) -> None:
     """The angle's annealing changes with every step of a training."""
     counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
@@ -571,26 +480,6 @@ def test_annealing_does_not_compile_again(native: None) -> None:
         expected = ours(inputs[0], inputs[0].new_full((), 2.7), *inputs[1:], step / 20, 0.0)
         assert_close(compiled(*inputs, step / 20), expected, 1e-13)
     assert counter.frame_count <= 2  # the first number, and all others
-
-
-def test_modes_are_bitwise_equal_for_any_thread_count(native: None) -> None:
-    found = []
-    counts = torch.randint(0, 400, (301,), generator=torch.Generator().manual_seed(2)).tolist()
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
-        results = []
-        for eps in (0.0, 1e-5):
-            results += section_results(ours, sections((70_001,), torch.float32), 2.7, 0.4, eps)
-        density, _, length = (tensor.requires_grad_() for tensor in sections((70_001,), torch.float32))
-        alpha = sdf_to_alpha(density.abs(), mode="density", section_length=length)
-        results += [alpha, *torch.autograd.grad(alpha.square().sum(), (density, length))]
-        sdf, offsets = packed(counts, torch.float32)
-        inv_s = torch.tensor(2.7, requires_grad=True)
-        alpha = sdf_to_alpha(sdf.requires_grad_(), inv_s, ray_offsets=offsets)
-        results += [alpha, *torch.autograd.grad(alpha.square().sum(), (sdf, inv_s))]
-        found.append(results)
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
 
 @pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
@@ -635,13 +524,6 @@ def test_empty_sections(backend: str, shape: tuple[int, ...]) -> None:
     out.sum().backward()
     assert inv_s.grad == 0
     assert sdf_to_alpha(sdf, mode="density", section_length=length).shape == shape[:2]
-
-
-def test_autocast(backend: str) -> None:
-    sdf, cosine, length = sections((6, 8), torch.float32)
-    with torch.autocast("cpu", torch.bfloat16):
-        out = ours(sdf.bfloat16(), torch.tensor(2.7), cosine, length, 0.3, 0.0)
-    assert out.dtype == torch.float32
 
 
 def test_errors(backend: str) -> None:

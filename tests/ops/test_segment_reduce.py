@@ -163,28 +163,6 @@ def test_gradcheck(backend: str, reduce: str) -> None:
 
 
 @pytest.mark.parametrize("reduce", REDUCTIONS)
-@pytest.mark.parametrize("rows", [0, 15])
-def test_opcheck(native: None, rows: int, reduce: str) -> None:
-    features, index = case(rows, 3, 7, torch.float32)
-    torch.library.opcheck(torch.ops.pred.segment_reduce.default, (features.requires_grad_(), index, 7, reduce))
-    _, saved = torch.ops.pred.segment_reduce(features.detach(), index, 7, reduce)
-    grad = torch.randn(7, 3, requires_grad=True)
-    torch.library.opcheck(torch.ops.pred.segment_reduce_backward.default, (grad, index, saved, reduce))
-
-
-@pytest.mark.parametrize("reduce", REDUCTIONS)
-def test_compiles_to_one_graph(backend: str, reduce: str) -> None:
-    features, index = case()
-    features.requires_grad_()
-    compiled = torch.compile(
-        lambda f, i: segment_reduce(f, i, 12, reduce).sin().sum(), fullgraph=True, backend="aot_eager"
-    )
-    (actual,) = torch.autograd.grad(compiled(features, index), features)
-    (expected,) = torch.autograd.grad(segment_reduce(features, index, 12, reduce).sin().sum(), features)
-    assert_close(actual, expected, 1e-14)
-
-
-@pytest.mark.parametrize("reduce", REDUCTIONS)
 @pytest.mark.parametrize("rows,segments", [(0, 3), (0, 0), (4, 0), (4, 3)])
 def test_nothing_to_reduce(backend: str, rows: int, segments: int, reduce: str) -> None:
     features = torch.full((rows, 5), math.nan, requires_grad=True)
@@ -192,19 +170,6 @@ def test_nothing_to_reduce(backend: str, rows: int, segments: int, reduce: str) 
     assert out.shape == (segments, 5) and not out.any()
     out.sum().backward()
     assert features.grad is not None and features.grad.shape == (rows, 5) and not features.grad.any()
-
-
-@pytest.mark.parametrize("reduce", REDUCTIONS)
-def test_memory_layouts_agree(backend: str, reduce: str) -> None:
-    features, index = case()
-    expected = segment_reduce(features, index, 12, reduce)
-    assert torch.equal(segment_reduce(features.t().contiguous().t(), index, 12, reduce), expected)
-    strided = index.repeat_interleave(3)[::3]
-    assert torch.equal(segment_reduce(features.repeat(1, 2)[:, :5], strided, 12, reduce), expected)
-    features.requires_grad_()  # the gradient of a sum is an expanded scalar
-    (grad,) = torch.autograd.grad(segment_reduce(features, index, 12, reduce).sum(), features)
-    ones = torch.ones(12, 5, dtype=torch.float64)
-    assert torch.equal(grad, torch.autograd.grad(segment_reduce(features, index, 12, reduce), features, ones)[0])
 
 
 def test_errors(backend: str) -> None:
@@ -247,11 +212,3 @@ def test_direct_calls_are_checked(native: None) -> None:
         backward(features[:11], torch.full((4,), 11), torch.empty(0, dtype=torch.int32), "sum")
     with pytest.raises(KERNEL_ERROR, match=r"saved must belong to grad of shape \[12, 5\], got \[12, 4\]"):
         backward(features[:12], index, torch.zeros(12, 4, dtype=torch.int32), "max")
-
-
-def test_autocast_computes_in_float32(backend: str) -> None:
-    features, index = case(dtype=torch.float32)
-    with torch.autocast("cpu", torch.bfloat16):
-        out = segment_reduce(features.bfloat16(), index, 12, "mean")
-    assert out.dtype == torch.float32
-    assert_close(out, segment_reduce(features.bfloat16().float(), index, 12, "mean"), 1e-6)

@@ -8,12 +8,10 @@ from collections.abc import Sequence
 import pytest
 import torch
 from torch import Tensor
-from torch._dynamo.testing import CompileCounterWithBackend
 
 from benchmarks.cases import POINT_RANGE_M, lidar_points
 from pred.ops import HardVoxels, reference, voxelize_hard
 from tests.conftest import KERNEL_ERROR
-from tests.tolerances import assert_close
 
 RANGE = (-51.2, -51.2, -5.0, 51.2, 51.2, 3.0)
 SIZES = [(0.1, 0.1, 0.2), (0.2, 0.2, 8.0), (3.2, 1.6, 0.4)]
@@ -229,39 +227,6 @@ def test_all_points_outside(backend: str) -> None:
     assert voxels.voxels.shape == (0, 2, 5) and voxels.counts.shape == (0,)
     voxels.voxels.sum().backward()
     assert points.grad is not None and not points.grad.any()
-
-
-@pytest.mark.parametrize("num_points", [0, 40])
-def test_opcheck(native: None, num_points: int) -> None:
-    points, offsets = cloud(num_points), torch.tensor([0, num_points // 2, num_points])
-    arguments = (offsets, list(SIZES[1]), list(RANGE), [512, 512, 1], 3, 15)
-    torch.library.opcheck(torch.ops.pred.voxelize_hard.default, (points.requires_grad_(), *arguments))
-    voxels, *_, slots = torch.ops.pred.voxelize_hard(points.detach(), *arguments)
-    grad = torch.randn_like(voxels).requires_grad_()
-    torch.library.opcheck(torch.ops.pred.voxelize_hard_backward.default, (grad, slots))
-
-
-@torch._dynamo.config.patch(capture_dynamic_output_shape_ops=True)
-def test_compiles_to_one_graph(native: None) -> None:
-    def mean_per_voxel(points: Tensor, offsets: Tensor) -> Tensor:
-        found = voxelize_hard(points, offsets, SIZES[1], RANGE, 4, 50)
-        return found.voxels.sum(dim=1) / found.counts[:, None]
-
-    counter = CompileCounterWithBackend("aot_eager")
-    compiled = torch.compile(mean_per_voxel, fullgraph=True, backend=counter)
-    for num_points in (40, 90, 55, 300, 77):
-        points, offsets = cloud(num_points).requires_grad_(), torch.tensor([0, 10, num_points])
-        actual, expected = compiled(points, offsets), mean_per_voxel(points, offsets)
-        assert torch.equal(actual, expected)
-        slope, expected_slope = (torch.autograd.grad(out.square().sum(), points)[0] for out in (actual, expected))
-        assert_close(slope, expected_slope, 1e-6)
-    assert counter.frame_count <= 2
-
-
-def test_autocast_computes_in_float32(backend: str) -> None:
-    points, offsets = cloud(100).bfloat16(), torch.tensor([0, 100])
-    with torch.autocast("cpu", torch.bfloat16):
-        assert voxelize_hard(points, offsets, SIZES[1], RANGE, 4, 50).voxels.dtype == torch.float32
 
 
 def test_errors(backend: str) -> None:
