@@ -271,7 +271,7 @@ def _reference(
             activation, slope = _SoftplusAndSlope.apply(activation, settings.softplus_beta)
             slopes.append(slope)
         else:
-            activation = F.softplus(activation, settings.softplus_beta)
+            activation = _softplus(activation, settings.softplus_beta)
     output = F.linear(activation, weights[-1], biases[-1])
 
     gradient = None
@@ -296,6 +296,11 @@ def _encoding_gradient(by_encoding: Tensor, encoding: Tensor, frequencies: int) 
     return by_position + (by_angle * octaves[:, None]).sum(-2)
 
 
+def _softplus(activation: Tensor, beta: float) -> Tensor:
+    """By its definition; ``F.softplus`` is the identity from 20 / beta on, 2e-9 / beta off."""
+    return torch.logaddexp(activation * beta, activation.new_zeros(())) / beta
+
+
 class _SoftplusAndSlope(torch.autograd.Function):
     """Softplus and its derivative, sigmoid(beta z), with one cheap backward for both."""
 
@@ -304,7 +309,7 @@ class _SoftplusAndSlope(torch.autograd.Function):
         slope = torch.sigmoid(activation * beta)
         ctx.save_for_backward(slope)
         ctx.beta = beta
-        return F.softplus(activation, beta), slope
+        return _softplus(activation, beta), slope
 
     @staticmethod
     @once_differentiable
