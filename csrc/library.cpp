@@ -44,6 +44,10 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "sample_volume_with_grad_backward(Tensor? grad_values, Tensor? grad_grads, Tensor volume, Tensor grid, "
       "bool border, bool align_corners, bool need_volume, bool need_grid) -> (Tensor, Tensor)");
 
+  m.def("project_bev(Tensor bev, Tensor weight) -> Tensor");
+  m.def(
+      "project_bev_backward(Tensor grad, Tensor bev, Tensor weight, bool need_bev, bool need_weight) -> "
+      "(Tensor, Tensor)");
   m.def(
       "decode_field(Tensor projected, Tensor points, Tensor parameters, int[] widths, float[] point_range, int "
       "octaves, "

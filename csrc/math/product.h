@@ -21,6 +21,18 @@ constexpr int kTileRows = 12;  // 24 of 32 registers accumulate
 constexpr int kTileRows = 6;  // 12 of 16
 #endif
 
+// Gives out pieces of a block of memory; from null, only their total size is of use.
+struct Arena {
+  uintptr_t at;
+
+  template <typename X>
+  X* take(int64_t count) {
+    const uintptr_t begin = (at + 63) / 64 * 64;
+    at = begin + uintptr_t(count) * sizeof(X);
+    return (X*)begin;
+  }
+};
+
 template <typename S>
 constexpr int kPair = std::is_same_v<S, BFloat16> ? 2 : 1;
 
@@ -143,6 +155,31 @@ static inline void product(const S* a, int64_t a_stride, int64_t rows, int64_t k
   }
 }
 
+// Rows as outer_product wants them: bfloat16 as [(count + 1) / 2][stride][2], with zeros where a row is missing.
+template <typename S>
+static const S* interleave(const S* rows, int64_t stride, int64_t count, S* buffer) {
+  if constexpr (kPair<S> == 1) {
+    return rows;
+  } else {
+    for (int64_t r = 0; r < count; r += 2) {
+      const S *first = rows + r * stride, *second = first + stride;
+      S* to = buffer + r * stride;
+      if (r + 1 < count) {
+        for (int64_t c = 0; c < stride; ++c) {
+          to[2 * c] = first[c];
+          to[2 * c + 1] = second[c];
+        }
+      } else {
+        for (int64_t c = 0; c < stride; ++c) {
+          to[2 * c] = first[c];
+          to[2 * c + 1] = S{0};
+        }
+      }
+    }
+    return buffer;
+  }
+}
+
 template <int kRows, typename S>
 static inline void outer_tile(const S* a, int64_t a_stride, const S* b, int64_t b_stride, int64_t samples,
                               Compute<S>* sum, int64_t sum_stride) {
@@ -170,8 +207,7 @@ static inline void outer_tile(const S* a, int64_t a_stride, const S* b, int64_t 
   }
 }
 
-// sum[m, n] += sum_i a[i, m] b[i, n]: m < rows; n < columns, a multiple of kPanel. Bfloat16 operands are interleaved:
-// [samples / 2][columns][2].
+// sum[m, n] += sum_i a[i, m] b[i, n]: m < rows; n < columns, a multiple of kPanel. Both are interleaved.
 template <typename S>
 static inline void outer_product(const S* a, int64_t a_stride, int64_t rows, const S* b, int64_t b_stride,
                                  int64_t columns, int64_t samples, Compute<S>* sum, int64_t sum_stride) {

@@ -28,27 +28,6 @@ const FieldKernels<S>& field_kernels() {
     return PRED_KERNELS(decode_field_bf16);
 }
 
-// Calls `body` with S, the type of the projected map, and T = Compute<S>.
-#define PRED_DISPATCH_FIELD(op, dtype, ...)                                                            \
-  [&] {                                                                                                \
-    switch (dtype) {                                                                                   \
-      case ::pred::ScalarType::BFloat16: {                                                             \
-        using S = ::pred::BFloat16;                                                                    \
-        return __VA_ARGS__();                                                                          \
-      }                                                                                                \
-      case ::pred::ScalarType::Float: {                                                                \
-        using S = float;                                                                               \
-        return __VA_ARGS__();                                                                          \
-      }                                                                                                \
-      case ::pred::ScalarType::Double: {                                                               \
-        using S = double;                                                                              \
-        return __VA_ARGS__();                                                                          \
-      }                                                                                                \
-      default:                                                                                         \
-        throw std::invalid_argument(std::string(op) + ": dtype must be float32, float64 or bfloat16"); \
-    }                                                                                                  \
-  }()
-
 // Samples per task of the forward pass.
 constexpr int64_t kForwardGrain = 960;
 // A block of samples has its own sums of the parameters' gradients, which are then added in order: no more blocks than

@@ -13,18 +13,6 @@ namespace {
 
 constexpr int64_t kTile = 96;  // samples
 
-// Gives out pieces of a block of memory; from null, only their total size is of use.
-struct Arena {
-  uintptr_t at;
-
-  template <typename X>
-  X* take(int64_t count) {
-    const uintptr_t begin = (at + 63) / 64 * 64;
-    at = begin + uintptr_t(count) * sizeof(X);
-    return (X*)begin;
-  }
-};
-
 template <typename S>
 struct Tile {
   using T = Compute<S>;
@@ -346,31 +334,6 @@ static void reverse(const FieldArgs<S>& a, const Tile<S>& tile, int64_t count, b
     } else {
       product(tile.back[l], stride, count, tile.width, a.down[l], tile.width, epilogue);
     }
-  }
-}
-
-// Rows as the second factor, or the first, of an outer product wants them.
-template <typename S>
-static const S* interleave(const S* rows, int64_t stride, int64_t count, S* buffer) {
-  if constexpr (kPair<S> == 1) {
-    return rows;
-  } else {
-    for (int64_t r = 0; r < count; r += 2) {
-      const S *first = rows + r * stride, *second = first + stride;
-      S* to = buffer + r * stride;
-      if (r + 1 < count) {
-        for (int64_t c = 0; c < stride; ++c) {
-          to[2 * c] = first[c];
-          to[2 * c + 1] = second[c];
-        }
-      } else {
-        for (int64_t c = 0; c < stride; ++c) {
-          to[2 * c] = first[c];
-          to[2 * c + 1] = S{0};
-        }
-      }
-    }
-    return buffer;
   }
 }
 

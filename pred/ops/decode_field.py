@@ -20,6 +20,7 @@ from pred.ops._check import (
     check_choice,
     check_count,
     check_dtype,
+    check_features,
     check_flags,
     check_like,
     check_number,
@@ -69,13 +70,31 @@ def project_bev(
     ``decode_field(bev, ...)``.
 
     Args:
-        bev: ``[B, C, H, W]``, any floating dtype.
-        weight: weight of the decoder's first layer; its first C columns are applied.
+        bev: ``[B, C, H, W]`` float32, float64 or bfloat16, which is multiplied as such and summed in float32.
+        weight: weight of the decoder's first layer, float64 with a float64 map, else float32; its first C columns are
+            applied.
 
     Returns:
-        ``[B, hidden, H, W]`` in channels-last memory. Differentiable any number of times.
+        ``[B, hidden, H, W]`` in the map's dtype and channels-last memory. Differentiable once; deterministic for any
+        number of threads.
+
+    Raises:
+        ValueError: shapes, devices. TypeError: dtypes.
     """
-    return F.linear(bev.permute(0, 2, 3, 1), weight[:, : bev.shape[1]]).permute(0, 3, 1, 2)
+    op = "project_bev"
+    _native.refuse_transforms(op)
+    check_tensors(op, bev=bev, weight=weight)
+    check_shape(op, "bev", bev, ("B", "C", "H", "W"))
+    check_dtype(op, "bev", bev, (*FLOATING, torch.bfloat16))
+    channels = bev.shape[1]
+    if weight.dim() != 2 or weight.shape[1] < channels or weight.numel() == 0 or channels == 0:
+        raise ValueError(f"{op}: weight must have shape [hidden, {channels} or more], got {list(weight.shape)}")
+    check_features(op, "bev", bev, "weight", weight)
+    columns = weight[:, :channels]
+    if not _native.use_native(op, bev):
+        return F.linear(bev.permute(0, 2, 3, 1), columns.to(bev.dtype)).permute(0, 3, 1, 2)
+    projected: Tensor = torch.ops.pred.project_bev(bev, columns)
+    return projected
 
 
 def decode_field(
@@ -136,8 +155,8 @@ def decode_field(
         return _reference(bev, points, weights, biases, settings, with_gradient, projected)
     first = weights[0]
     channels = first.shape[1] - 3 - 6 * settings.frequencies
-    grid = bev if projected else project_bev(bev.to(points.dtype), first)
-    grid = grid.to(torch.bfloat16 if precision == "bf16" else points.dtype)
+    storage = torch.bfloat16 if precision == "bf16" else points.dtype
+    grid = bev.to(storage) if projected else project_bev(bev.to(storage), first)
     rows = [first[:, channels:], *weights[1:]]
     parameters = torch.cat([part.reshape(-1) for pair in zip(rows, biases, strict=True) for part in pair])
     widths = [first.shape[1] - channels, *(weight.shape[0] for weight in weights)]
@@ -320,7 +339,35 @@ class _SoftplusAndSlope(torch.autograd.Function):
         return bend.add_(grad_value).mul_(slope), None
 
 
-# --- Compiled op -----------------------------------------------------------------------------------
+# --- Compiled ops ----------------------------------------------------------------------------------
+def _channels_last(like: Tensor, channels: int) -> Tensor:
+    frames, _, height, width = like.shape
+    return like.new_empty(frames, height, width, channels).permute(0, 3, 1, 2)
+
+
+def _project_fake(bev: Tensor, weight: Tensor) -> Tensor:
+    return _channels_last(bev, weight.shape[0])
+
+
+def _project_save(ctx: Any, inputs: Any, output: Any) -> None:
+    ctx.save_for_backward(*inputs)
+
+
+def _project_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+    need = ctx.needs_input_grad
+    found = torch.ops.pred.project_bev_backward(grad, *ctx.saved_tensors, need[0], need[1])
+    return tuple(value if wanted else None for value, wanted in zip(found, need, strict=True))
+
+
+def _project_backward_fake(
+    grad: Tensor, bev: Tensor, weight: Tensor, need_bev: bool, need_weight: bool
+) -> tuple[Tensor, Tensor]:
+    return (
+        _channels_last(bev, bev.shape[1]) if need_bev else bev.new_empty(0),
+        weight.new_empty(weight.shape[0] if need_weight else 0, weight.shape[1]),
+    )
+
+
 def _fake(
     projected: Tensor,
     points: Tensor,
@@ -388,11 +435,13 @@ def _backward_fake(
 ) -> tuple[Tensor, Tensor, Tensor]:
     frames, count = points.shape[:2]
     return (
-        torch.empty_like(projected, memory_format=torch.channels_last) if need_projected else projected.new_empty(0),
+        _channels_last(projected, projected.shape[1]) if need_projected else projected.new_empty(0),
         points.new_empty(frames if need_points else 0, count, 3),
         parameters.new_empty(parameters.shape[0] if need_parameters else 0),
     )
 
 
+_native.register("project_bev", fake=_project_fake, setup_context=_project_save, backward=_project_backward)
+_native.register("project_bev_backward", fake=_project_backward_fake)
 _native.register("decode_field", fake=_fake, setup_context=_save, backward=_backward)
 _native.register("decode_field_backward", fake=_backward_fake)

@@ -282,7 +282,7 @@ def test_errors(backend: str) -> None:
 
     with pytest.raises(ValueError, match=r"decode_field: points must have shape \[2, N, 3\], got \[2, 110, 2\]"):
         call(points=points[..., :2])
-    with pytest.raises(ValueError, match=r"decode_field: weights\[0\] must have shape \[32, 27\], got \[32, 26\]"):
+    with pytest.raises(ValueError, match=r"decode_field: weights\[0\] must have shape \[hidden, 27\], got \[32, 26\]"):
         call(weights=[weights[0][:, 1:], *weights[1:]])
     with pytest.raises(ValueError, match=r"decode_field: weights\[1\] must have shape \[32, 32\], got \[32, 31\]"):
         call(weights=[weights[0], weights[1][:, 1:], weights[2]])
