@@ -79,7 +79,8 @@ static inline void section_slopes(const Row<T>& row) {
   T* __restrict slope = row.slope;
   for (int64_t i = 0; i < row.size; ++i) {
     const T steep = (t[i + 1] - t[i]) / (cdf[i + 1] - cdf[i]);
-    slope[i] = steep <= Limits<T>::largest ? steep : T(0);  // of an empty section: infinite or NaN
+    // Of an empty section it is infinite or NaN, and negative where rounding makes the distribution fall.
+    slope[i] = steep >= T(0) && steep <= Limits<T>::largest ? steep : T(0);
   }
 }
 
