@@ -20,26 +20,26 @@ def added_peak_bytes(run: Callable[[], object]) -> int | None:
     What the call returns counts, its inputs do not. Blocks that a library keeps from its first call on (compiled
     graphs, oneDNN's scratch) do not count either if the function was called before.
     """
-    before = _reset_peak()
+    before = reset_peak()
     result = run()
     if before is None:
         return None
-    peak = _status_bytes("VmHWM")
+    peak = status_bytes("VmHWM")
     del result
     return max(0, peak - before)
 
 
-def _reset_peak() -> int | None:
-    """Resident memory now, from where the peak starts anew."""
+def reset_peak() -> int | None:
+    """Resident memory now, from where the peak (``VmHWM``) starts anew; None where the system cannot tell."""
     try:
         ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5")
-        return _status_bytes("VmRSS")
+        return status_bytes("VmRSS")
     except (OSError, AttributeError, TypeError):  # no such file, not allowed; another C library; no dlopen(NULL)
         return None
 
 
-def _status_bytes(name: str) -> int:
+def status_bytes(name: str) -> int:
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(name + ":"):
             return 1024 * int(line.split()[1])

@@ -86,7 +86,8 @@ def _voxelize_hard_cases(sizes: Sizes) -> list[Case]:
     limits = (sizes.voxel_points, sizes.max_voxels)
     inputs = (points, torch.tensor([0, sizes.points]))
     voxels = reference.voxelize_hard(*inputs, size, cases.POINT_RANGE_M, *limits).voxels
-    forward = points.nbytes + voxels.nbytes + 40 * len(voxels)
+    slots = 8 * len(points)  # written for backward, and read there
+    forward = points.nbytes + slots + voxels.nbytes + 40 * len(voxels)
     return [
         Case(
             op="voxelize_hard",
@@ -103,8 +104,12 @@ def _voxelize_hard_cases(sizes: Sizes) -> list[Case]:
             derivative_in=(0,),
             tolerance=0.0,
             phases=(
-                Phase(FORWARD, "4 N C + 4 M max_points C + 40 M", forward, (Target("peer", 2),)),
-                Phase(BACKWARD, "8 N C + 8 M max_points C + 40 M", forward + points.nbytes + voxels.nbytes),
+                Phase(FORWARD, "4 N C + 8 N + 4 M max_points C + 40 M", forward, (Target("peer", 2),)),
+                Phase(
+                    BACKWARD,
+                    "8 N C + 16 N + 8 M max_points C + 40 M",
+                    forward + voxels.nbytes + slots + points.nbytes,
+                ),
             ),
             peers=peers.voxelize_hard(columns, size, cases.POINT_RANGE_M, *limits),
         )

@@ -209,7 +209,8 @@ def _mutate(rng: random.Random, value: Any) -> Any:
     if isinstance(value, float):
         return rng.choice([*SPECIAL, 0, "x", torch.tensor(value)])
     if isinstance(value, str):
-        return rng.choice(["", value.upper(), value + "\0", value * 1000, "zeros", None, 0, b"zeros", [value]])
+        longer = (value * 1000)[:10_000]
+        return rng.choice(["", value.upper(), value + "\0", longer, "zeros", None, 0, b"zeros", [value]])
     if isinstance(value, (list, tuple)):
         items = list(value)
         if not items or rng.random() < 0.3:

@@ -33,6 +33,8 @@ COPIED = (
     "tests/ops",
     "benchmarks",
 )  # inputs are shared
+NOT_CHECKED = "NOT CHECKED"
+RELEASE = re.compile(r"\d+(\.\d+)+(\+.*)?")
 FACTS = """
 import sys, torch
 from pred import _native
@@ -43,10 +45,19 @@ print(f"torch {torch.__version__}, Python {sys.version.split()[0]}, wheel built 
 """
 
 
-def run(command: list[str], cwd: Path | None = None) -> None:
-    """Runs a command without the variables that would change what is tested."""
+def clean_env() -> dict[str, str]:
+    """Without the variables that would change what is tested."""
     kept = {key: value for key, value in os.environ.items() if not key.startswith(("PRED_", "PYTHON"))}
-    subprocess.run(command, check=True, cwd=cwd, env=kept | {"PRED_REQUIRE_NATIVE": "1"})
+    return kept | {"PRED_REQUIRE_NATIVE": "1"}
+
+
+def run(command: list[str], cwd: Path | None = None) -> None:
+    subprocess.run(command, check=True, cwd=cwd, env=clean_env())
+
+
+def ask(command: list[str], cwd: Path | None = None) -> str:
+    """What a command prints."""
+    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=cwd, env=clean_env()).stdout
 
 
 def build() -> Path:
@@ -83,18 +94,22 @@ def parse(text: str) -> tuple[str, str]:
 
 
 def release(version: str) -> tuple[int, ...]:
-    """2.13.0+cpu as (2, 13, 0)."""
-    return tuple(int(number) for number in version.partition("+")[0].split("."))
+    """2.13.0+cpu as (2, 13, 0); 2.14.0rc1, or a nightly that the wheel was built with, as (2, 14, 0)."""
+    found = re.match(r"\d+(\.\d+)*", version)
+    assert found is not None, version
+    return tuple(int(number) for number in found.group().split("."))
 
 
 def newest_torch(python: Path, wheel: Path) -> str | None:
     """The newest torch that the index has for this Python, if it is newer than the one the wheel was built with."""
     built = json.loads(zipfile.ZipFile(wheel).read("pred/build_info.json"))["torch"]
     command = [str(python), "-m", "pip", "--disable-pip-version-check", "index", "versions", "torch"]
-    answer = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    answer = ask(command)
     listed = re.search(r"^Available versions: (.*)$", answer, re.MULTILINE)
-    assert listed is not None, answer
-    newest = max(listed.group(1).split(", "), key=release)
+    found = [version for version in listed.group(1).split(", ") if RELEASE.fullmatch(version)] if listed else []
+    if not found:
+        sys.exit(f"wheel_check: pip lists no release of torch for {python}:\n{answer}")
+    newest = max(found, key=release)
     return newest if release(newest) > release(built) else None
 
 
@@ -106,7 +121,8 @@ def check(wheel: Path, torch: str, python: str) -> tuple[str, str]:
     if torch == "newest":
         found = newest_torch(binary, wheel)
         if found is None:
-            return "newest torch", "NOT CHECKED: the index has none that is newer than the wheel's"
+            shutil.rmtree(environment)
+            return f"newest torch for {python}", f"{NOT_CHECKED}: the index has none that is newer than the wheel's"
         torch = found
     print(f"torch {torch}: pip downloads 2 to 4 GB with its CUDA libraries; {environment} takes some 6 GB", flush=True)
     install = [str(binary), "-m", "pip", "--disable-pip-version-check", "-q", "install"]
@@ -121,11 +137,11 @@ def check(wheel: Path, torch: str, python: str) -> tuple[str, str]:
                 shutil.copytree(source, target, ignore=shutil.ignore_patterns("results", "__pycache__"))
             else:
                 shutil.copy(source, target)
-        facts = subprocess.run([str(binary), "-c", FACTS], cwd=outside, capture_output=True, text=True, check=True)
-        print(facts.stdout, end="", flush=True)
+        facts = ask([str(binary), "-c", FACTS], outside)
+        print(facts, end="", flush=True)
         run([str(binary), "-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", "pythonpath=.", "tests/ops"], outside)
     shutil.rmtree(environment)
-    return facts.stdout.strip(), "passed"
+    return facts.strip(), "passed"
 
 
 def main() -> int:
@@ -135,7 +151,9 @@ def main() -> int:
     options = parser.parse_args()
     checks = [parse(text) for text in options.checks]  # before the wheel is built
     wheel = options.wheel or build()
-    results, failed = [], 0
+    results: list[str] = []
+    skipped: list[str] = []
+    failed = 0
     for torch, python in checks:
         started = time.monotonic()
         try:
@@ -143,8 +161,9 @@ def main() -> int:
         except subprocess.CalledProcessError as error:
             print(error.stderr or "", file=sys.stderr)
             facts, result, failed = f"torch {torch}", f"FAILED ({error})", failed + 1
-        results.append(f"{facts}: {result} in {time.monotonic() - started:.0f} s")
-    print("\n".join(results))
+        line = f"{facts}: {result} in {time.monotonic() - started:.0f} s"
+        (skipped if result.startswith(NOT_CHECKED) else results).append(line)
+    print("\n".join(results + skipped))
     return 1 if failed else 0
 
 

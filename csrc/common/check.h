@@ -47,7 +47,7 @@ inline std::string shape_text(const Tensor& tensor) { return shape_text(sizes(te
   } while (0)
 
 inline void check_cpu_tensor(const char* op, const char* name, const Tensor& tensor, int64_t dim, ScalarType dtype) {
-  PRED_CHECK(tensor.is_cpu(), op, ": ", name, " must be a CPU tensor");
+  PRED_CHECK(tensor.is_cpu(), op, ": ", name, " must be a CPU tensor, got one on another device");
   PRED_CHECK(tensor.dim() == dim, op, ": ", name, " must have ", dim, " dimensions, got shape ", shape_text(tensor));
   PRED_CHECK(tensor.scalar_type() == dtype, op, ": ", name, " must have the dtype of the other arguments");
 }

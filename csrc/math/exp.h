@@ -34,7 +34,7 @@ struct Doubles {
   typedef double Type __attribute__((vector_size(2 * sizeof(V))));
 };
 
-// Not rounded before the result is. double: for |a|, |b| < 2^995.
+// With an exact product. double: for |a|, |b| < 2^995.
 template <typename V>
 PRED_HOST_DEVICE V fused_multiply_subtract(V a, V b, V c) {
   if constexpr (std::is_same_v<V, float>) {
@@ -56,8 +56,11 @@ PRED_HOST_DEVICE V fused_multiply_subtract(V a, V b, V c) {
 }
 
 #if defined(__FMA__) || defined(__CUDACC__)
+constexpr bool kFused = true;
 PRED_HOST_DEVICE float fused_multiply_subtract(float a, float b, float c) { return __builtin_fmaf(a, b, -c); }
 PRED_HOST_DEVICE double fused_multiply_subtract(double a, double b, double c) { return __builtin_fma(a, b, -c); }
+#else
+constexpr bool kFused = false;
 #endif
 #if defined(__FMA__) && !defined(__CUDACC__)
 // The compiler has no fused product for its own vector types.
@@ -121,6 +124,7 @@ PRED_HOST_DEVICE V exp2m1_reduced(V f) {
 template <typename T>
 struct ExpScale {
   T high, low, lowest;
+  T shrink, grown;  // powers of 2 apart: x shrink and high / shrink, whose product is split where it is not fused
 };
 
 template <typename T>
@@ -131,10 +135,12 @@ PRED_HOST_DEVICE ExpScale<T> exp_scale(T s) {
   if constexpr (sizeof(T) == 4) {
     const double exact = double(s) * log2e;
     const T high = T(exact);
-    return {high, T(exact - double(high)), ExpConstants<T>::lowest / high};
+    return {high, T(exact - double(high)), ExpConstants<T>::lowest / high, T(1), high};
   } else {
     const T high = s * log2e;
-    return {high, fused_multiply_subtract(s, log2e, high) + s * log2e_low, ExpConstants<T>::lowest / high};
+    const T shrink = s < T(1) ? T(0x1p-64) : T(1);  // x may be large where s is small
+    return {high, fused_multiply_subtract(s, log2e, high) + s * log2e_low, ExpConstants<T>::lowest / high, shrink,
+            high / shrink};
   }
 }
 
@@ -152,7 +158,10 @@ PRED_HOST_DEVICE Exp<V> exp_nonpositive(const ExpScale<T>& s, V x) {
   const V bounded = x < lowest ? lowest : x;
   const V shifted = bounded * s.high + Constants::round;
   const V n = shifted - Constants::round;
-  const V f = fused_multiply_subtract(bounded, s.high - V{}, n) + bounded * s.low;
+  const bool splits = sizeof(T) == 8 && !kFused;
+  const V product = splits ? fused_multiply_subtract(bounded * s.shrink, s.grown - V{}, n)
+                           : fused_multiply_subtract(bounded, s.high - V{}, n);
+  const V f = product + bounded * s.low;
   const V p = exp2m1_reduced(f);
   typename Lane<V>::Bits bits;
   __builtin_memcpy(&bits, &shifted, sizeof bits);

@@ -102,7 +102,7 @@ struct CompositeInputs {
     args.values = pointer<S>("values", values, with(samples, args.channels));
   }
 
-  // More channels than that have tensors without rows only; the sizes of scratch rows need no further check.
+  // So that sizes of scratch rows need no further check.
   void check_channels(const char* name) const {
     PRED_CHECK(args.channels < int64_t(1) << 31, op, ": ", name, " must have fewer than 2^31 channels, got ",
                args.channels);
@@ -190,10 +190,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_backward(
     in.check_channels("grad_values");
   }
   PRED_CHECK(in.has_values || !grads.values || !(need.source || need.inv_s), in.op,
-             ": values must be given with grad_values");
-  PRED_CHECK(in.has_t || !grads.depth, in.op, ": t must be given with grad_depth");
-  PRED_CHECK(!need.t || grads.depth, in.op, ": grad_depth must be given with need_t");
-  PRED_CHECK(!need.values || grads.values, in.op, ": grad_values must be given with need_values");
+             ": values must be given with grad_values, got none");
+  PRED_CHECK(in.has_t || !grads.depth, in.op, ": t must be given with grad_depth, got none");
+  PRED_CHECK(!need.t || grads.depth, in.op, ": grad_depth must be given with need_t, got none");
+  PRED_CHECK(!need.values || grads.values, in.op, ": grad_values must be given with need_values, got none");
   const CompositeCotangents<S> grad{in.template pointer<T>("grad_weights", grads.weights, in.samples),
                                     in.template pointer<T>("grad_depth", grads.depth, {in.num_rays}),
                                     in.template pointer<T>("grad_opacity", grads.opacity, {in.num_rays}),

@@ -79,11 +79,12 @@ static inline void section_slopes(const Row<T>& row) {
   T* __restrict slope = row.slope;
   for (int64_t i = 0; i < row.size; ++i) {
     const T steep = (t[i + 1] - t[i]) / (cdf[i + 1] - cdf[i]);
-    slope[i] = steep <= Limits<T>::largest ? steep : T(0);  // of an empty section: infinite or NaN
+    // Of an empty section it is infinite or NaN, and negative where rounding makes the distribution fall.
+    slope[i] = steep >= T(0) && steep <= Limits<T>::largest ? steep : T(0);
   }
 }
 
-// Where u lies in a section. u below it, which is that of the sample before, becomes the section's start.
+// Where u lies in a section, or the end that is nearer. (Up to rounding, u may belong to a neighbour.)
 template <typename V>
 static inline __attribute__((always_inline)) V interpolate(V u, V cdf, V slope, V start, V end) {
   const V offset = u - cdf;
@@ -101,6 +102,7 @@ static inline void merge(int64_t num_new, const Row<T>& row) {
       store(row.out + i + 1 + k, interpolate(load<W>(row.u + k), splat<W>(row.cdf[i]), splat<W>(row.slope[i]),
                                              splat<W>(row.t[i]), splat<W>(row.t[i + 1])));
     }
+    row.out[i + begin] = row.t[i];  // in place of the sample before it
     begin = end;
   }
   row.out[row.sections + num_new] = row.t[row.sections];
@@ -124,9 +126,11 @@ static inline void merge_permuted(int64_t num_new, const Row<T>& row, int32_t* s
     const Index starts = load<W>(starts_at + p), count = prefix_sum<int32_t, W>(starts);
     const Index section = count - broadcast<0, int32_t, W>(starts), sample = lane_numbers<int32_t, W>() - section;
     const int64_t i = started - 1 + starts_at[p], k = p - i - 1;  // of lane 0
-    store(row.out + p, interpolate(permute(load<W>(row.u + k), sample), permute(load<W>(row.cdf + i), section),
-                                   permute(load<W>(row.slope + i), section), permute(load<W>(row.t + i), section),
-                                   permute(load<W>(row.t + i + 1), section)));
+    const Vec<T, W> start = permute(load<W>(row.t + i), section);
+    const Vec<T, W> x =
+        interpolate(permute(load<W>(row.u + k), sample), permute(load<W>(row.cdf + i), section),
+                    permute(load<W>(row.slope + i), section), start, permute(load<W>(row.t + i + 1), section));
+    store(row.out + p, starts != 0 ? start : x);
     started += count[W - 1];
   }
 }

@@ -202,7 +202,9 @@ struct SampleGrid {
       cell_bits += order.size_bits[axis];
     }
     const int key_bits = bits_for(batch) + cell_bits;
-    PRED_CHECK(key_bits + order.number_bits < 64, op, ": the maps have too many cells and samples to number");
+    PRED_CHECK(key_bits + order.number_bits < 64, op, ": ", Op::kMap,
+               " must have fewer than 2^64 cells times samples, both rounded up to powers of 2, got 2^",
+               key_bits + order.number_bits);
     const auto sorted = sort_rows<uint64_t>(
         num_samples, order.number_bits, key_bits,
         [&](uint64_t* items, int64_t begin, int64_t end) { return k.pack(a, order, items, begin, end); });

@@ -22,7 +22,7 @@ struct VoxelizeHardArgs {
   int64_t num_items;
   VoxelKeyBits bits;
   const S* points;              // [N, C], contiguous
-  int64_t columns, max_points;  // D, P
+  int64_t columns, max_points;  // C, max_points
 };
 
 template <typename S, typename Item>

@@ -63,7 +63,7 @@ struct VoxelizeInputs {
     offsets = frame_offsets(op, "batch_offsets", batch_offsets, 'N', num_points());
     bits = {bits_for(grid_size[0]), bits_for(grid_size[1]), bits_for(grid_size[2]), bits_for(num_points())};
     key_bits = bits_for(num_frames()) + bits.x + bits.y + bits.z;
-    PRED_CHECK(key_bits <= 62, op, ": the frames' grids must have at most 2^62 voxels");
+    PRED_CHECK(key_bits <= 62, op, ": grid_size must give at most 2^62 voxels in all frames, got 2^", key_bits);
   }
 
   int64_t num_points() const { return points.size(0); }

@@ -78,7 +78,7 @@ def check_number(op: str, name: str, value: object) -> None:
         raise TypeError(f"{op}: {name} must be a number, got {type(value).__name__}")
     try:
         float(value)
-    except TypeError:  # an array of several
+    except (TypeError, ValueError):  # an array of several, or of text
         raise TypeError(f"{op}: {name} must be a number, got {type(value).__name__}") from None
     except OverflowError:
         raise ValueError(f"{op}: {name} must be in the range of float64, got a larger whole number") from None

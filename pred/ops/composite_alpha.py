@@ -54,8 +54,8 @@ def composite_alpha(
         NaN stays in its ray.
 
     Raises:
-        ValueError: shape, device, offsets (values are checked for CPU tensors), an unknown choice, or
-        ``transmittance_eps``. TypeError: dtype.
+        ValueError: shape, device, offsets (values are checked for CPU tensors), an unknown choice,
+        ``transmittance_eps``, or 2^40 or more rays or 2^31 or more channels (compiled). TypeError: dtype.
 
     Differentiable once in ``alpha``, ``t`` and ``values``, through all outputs. The derivative divides by nothing: it
     is exact where opacities are 0 or 1. Deterministic for any thread count.

@@ -60,8 +60,9 @@ def composite_rays(
         0. A NaN stays in its ray (and in the gradient of ``inv_s``, which all rays share).
 
     Raises:
-        ValueError: shape, device, an unknown choice, offsets (values are checked for CPU tensors), or the value of
-        ``inv_s`` (see :func:`pred.ops.sdf_to_alpha`). TypeError: dtype.
+        ValueError: shape, device, an unknown choice, offsets (values are checked for CPU tensors), the value of
+        ``inv_s`` (see :func:`pred.ops.sdf_to_alpha`), or 2^40 or more rays or 2^31 or more channels (compiled).
+        TypeError: dtype.
 
     Differentiable once in ``sdf``, ``inv_s``, ``t`` and ``values``, through all outputs; exact for opacities 0 and 1.
     Deterministic for any thread count.

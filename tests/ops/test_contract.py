@@ -8,6 +8,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import torch._dynamo.utils
@@ -191,7 +192,7 @@ def test_wrong_tensors_are_named(backend: str, example: Example) -> None:
 WRONG_PLAIN: dict[type, tuple[Any, ...]] = {
     bool: ("yes", None),
     int: (2.5, "2", None),
-    float: ("2", [2.0], torch.tensor(2.0), 10**400),
+    float: ("2", [2.0], np.array("abc"), torch.tensor(2.0), 10**400),
 }
 
 

@@ -4,8 +4,10 @@
 
 Both sides get the same numbers. The published one is written out here in plain PyTorch, with its constants, clips and
 order of operations, and runs in float64; ours is :func:`pred.ops.sdf_to_alpha` and :func:`pred.ops.composite_alpha`.
-Errors are norm-wise: the largest difference of a result or gradient, over its largest element in the whole batch. They
-are at most 1e-12 in float64 and 1e-5 in float32.
+Errors are norm-wise: the largest difference of a result or gradient, over its largest element in the whole batch. In
+float64 they are at most 1e-12, but for two gradients of UniPAD's rays that miss the sphere (``MISSING_DEPTH``). In
+float32 they are at most 1e-5; for the kinds of rays in ``CANCELLING`` a result or gradient that the published code in
+float32 itself does not give to 5e-6 may have twice that code's error.
 """
 
 from __future__ import annotations
@@ -111,7 +113,14 @@ def ours(
 
 # --- comparison ----------------------------------------------------------------------------------------------------
 
-CANCELLING = ("long", "sections", "inside", "missing")
+CANCELLING = ("long", "sections", "missing")
+"""The formula takes the difference of two sigmoids, of which a rounding of 1 remains: much beside the opacities of 1e-3
+and 1e-5 of which these rays consist. The published code in float32 is no better."""
+
+MISSING_DEPTH = {"grad_sdf": 5e-12, "grad_variance": 1e-10}
+"""In float64, the same: a rounding of 1e-16 beside opacities of 1e-5. UniPAD's depth divides by their sum. Measured:
+1e-12 and, in the gradient of the one sharpness, in which the rays cancel, 2.6e-11."""
+
 INPUTS = ("sdf", "gradient", "direction", "t", "color", "variance")
 
 
@@ -172,19 +181,20 @@ def test_published_compositing(
 ) -> None:
     inputs = rays(kind, num_rays, samples)
     wide = tuple(tensor.double() for tensor in inputs)
-    for cos_anneal in (0.0, 0.4, 1.0) if published is neus else (1.0,):
-        names = list(published(*wide, cos_anneal))
-        expected = results(published, wide, cos_anneal, names)
+    anneals = (0.0, 0.4, 1.0) if published is neus else (1.0,)
+    names = list(published(*wide, 1.0))
+    expected = {cos_anneal: results(published, wide, cos_anneal, names) for cos_anneal in anneals}
+    tolerance = dict.fromkeys(expected[1.0], TOLERANCE[dtype])
+    if kind in CANCELLING and dtype == torch.float32:
+        # Over all cos_anneal: how exact the gradient of the sharpness, a single number, comes out is chance.
+        for cos_anneal in anneals:
+            for name, value in results(published, inputs, cos_anneal, names).items():
+                error = relative_error(value.double(), expected[cos_anneal][name])
+                tolerance[name] = max(tolerance[name], 2 * error)
+    elif kind == "missing" and published is unipad:
+        tolerance |= MISSING_DEPTH
+    for cos_anneal in anneals:
         actual = results(ours, tuple(tensor.to(dtype) for tensor in inputs), cos_anneal, names)
-        tolerance = TOLERANCE[dtype]
-        if kind in CANCELLING and dtype == torch.float32:
-            # The formula takes the difference of two sigmoids, of which a rounding of 1 remains: much beside the
-            # opacities of 1e-3 and 1e-5 of which these rays consist. The published code in float32 is no better.
-            own = results(published, inputs, cos_anneal, names)
-            tolerance = max(
-                tolerance, 2 * max(relative_error(own[name].double(), value) for name, value in expected.items())
-            )
-        elif kind == "missing":
-            tolerance = 1e-10  # the same in float64: 1e-16 of 1e-5, and a gradient of the sharpness that cancels
         for name, value in actual.items():
-            assert_close(value.double(), expected[name], tolerance, f"{name} with cos_anneal {cos_anneal}")
+            what = f"{name} with cos_anneal {cos_anneal}"
+            assert_close(value.double(), expected[cos_anneal][name], tolerance[name], what)

@@ -191,6 +191,20 @@ def test_unsorted_and_outlying_u_touch_no_foreign_memory(backend: str) -> None:
     assert (out >= t[:, :1]).all() and (out <= t[:, -1:]).all()
 
 
+@pytest.mark.parametrize("unit, num_samples", [(0.53096, 13), (1 / 3, 46), (0.1, 24)])
+def test_no_sample_is_lost_where_rounding_makes_the_distribution_fall(
+    level: str, unit: float, num_samples: int
+) -> None:
+    # Sums of multiples of one number; a few of these rays fall by a rounding just where a u lies.
+    num_rays, edges = 8000, 50 if unit != 0.1 else 24
+    t = torch.arange(1, edges + 1, dtype=torch.float64).expand(num_rays, edges)
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.randint(0, 4, (num_rays, edges - 1), generator=generator).double() * unit
+    merged = resample_rays(t, weights, num_samples)
+    place = torch.searchsorted(merged, t.contiguous()).clamp_max(merged.shape[1] - 1)
+    assert torch.equal(merged.gather(1, place), t)
+
+
 def test_no_sample_is_lost_where_a_slope_overflows(level: str) -> None:
     t = torch.tensor([[0.0, 3e38, 3.1e38]])
     merged = resample_rays(t, torch.tensor([[3e-30, 1.0]]), 4)

@@ -600,6 +600,9 @@ def test_huge_distances_under_a_small_sharpness(level: str) -> None:
     sdf = torch.tensor([[3e36, 2e36, -1e36, -3e38]])
     expected = reference.sdf_to_alpha(sdf.double(), 1e-36)
     assert_close(sdf_to_alpha(sdf, 1e-36), expected.float(), FORWARD[torch.float32])
+    sdf = torch.tensor([[1e303, -1e303, -3e305]], dtype=torch.float64)
+    for inv_s in (1e-305, 1e-303, 0.0):
+        assert_close(sdf_to_alpha(sdf, inv_s), reference.sdf_to_alpha(sdf, inv_s), FORWARD[torch.float64])
 
 
 def test_packed_column_is_packed(backend: str) -> None:

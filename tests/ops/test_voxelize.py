@@ -251,5 +251,5 @@ def test_direct_calls_are_checked(native: None) -> None:
             call(points, torch.tensor([0, 10]), [0.1, wrong_size, 8.0], point_range, [512, 512, 1])
     with pytest.raises(KERNEL_ERROR, match="must hold 3, 6 and 3 numbers, got 3, 6 and 2"):
         call(points, torch.tensor([0, 10]), size, point_range, [512, 512])
-    with pytest.raises(KERNEL_ERROR, match=r"at most 2\^62 voxels"):
+    with pytest.raises(KERNEL_ERROR, match=r"grid_size must give at most 2\^62 voxels in all frames, got 2\^63"):
         call(points, torch.tensor([0, 10]), size, point_range, [2**30, 2**30, 8])
