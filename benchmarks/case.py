@@ -29,6 +29,9 @@ class Phase:
     """Formula of the bytes, in the letters of `pred.ops`."""
     traffic_bytes: int
     targets: tuple[Target, ...] = ()
+    work: str = ""
+    """Formula of the useful floating-point operations, where they and not the bytes are the limit."""
+    flop: int = 0
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ B frames, N points per frame, C BEV channels, H hidden width, K classes, P encod
 """
 
 from dataclasses import dataclass
-from typing import cast
+from typing import Literal, cast
 
 import torch
 import torch.nn.functional as F
@@ -40,6 +40,10 @@ class FieldConfig:
     """Metres of signed distance per unit of network output."""
     num_classes: int = 19
     """Semantic classes K (Cityscapes train ids)."""
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """Of the decoder's products; parameters stay float32."""
+    recompute: bool = False
+    """Whether the backward pass computes activations again in place of keeping them."""
 
     def __post_init__(self) -> None:
         for name, minimum in (("hidden", 1), ("layers", 2), ("frequencies", 0), ("num_classes", 1)):
@@ -110,7 +114,7 @@ class FieldDecoder(nn.Module):
 
         Callers that decode several sets of points from one map do this once.
         """
-        return project_bev(bev, self._linear_layers()[0].weight)
+        return project_bev(bev, self._linear_layers()[0].weight, self.config.precision)
 
     def decode(
         self,
@@ -135,6 +139,8 @@ class FieldDecoder(nn.Module):
             sdf_scale=self.config.sdf_scale_m,
             with_gradient=with_gradient,
             projected=True,
+            precision=self.config.precision,
+            recompute=self.config.recompute,
         )
 
     def _linear_layers(self) -> list[nn.Linear]:

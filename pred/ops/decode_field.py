@@ -62,6 +62,7 @@ class _Settings(NamedTuple):
 def project_bev(
     bev: Tensor,  # [B, C, H, W]
     weight: Tensor,  # [hidden, C + 3 + 6 F]
+    precision: Literal["fp32", "bf16"] = "fp32",
 ) -> Tensor:  # [B, hidden, H, W]
     """The first layer's share of the map, for callers that decode several sets of points from one map.
 
@@ -70,13 +71,14 @@ def project_bev(
     ``decode_field(bev, ...)``.
 
     Args:
-        bev: ``[B, C, H, W]`` float32, float64 or bfloat16, which is multiplied as such and summed in float32.
+        bev: ``[B, C, H, W]`` float32 or float64, or half precision, which is widened.
         weight: weight of the decoder's first layer, float64 with a float64 map, else float32; its first C columns are
             applied.
+        precision: as in :func:`decode_field`.
 
     Returns:
-        ``[B, hidden, H, W]`` in the map's dtype and channels-last memory. Differentiable once; deterministic for any
-        number of threads.
+        ``[B, hidden, H, W]`` in the weight's dtype, with ``"bf16"`` in bfloat16, and in channels-last memory.
+        Differentiable once; deterministic for any number of threads.
 
     Raises:
         ValueError: shapes, devices. TypeError: dtypes.
@@ -85,15 +87,18 @@ def project_bev(
     _native.refuse_transforms(op)
     check_tensors(op, bev=bev, weight=weight)
     check_shape(op, "bev", bev, ("B", "C", "H", "W"))
-    check_dtype(op, "bev", bev, (*FLOATING, torch.bfloat16))
+    check_dtype(op, "bev", bev, FLOATING + HALF)
     channels = bev.shape[1]
     if weight.dim() != 2 or weight.shape[1] < channels or weight.numel() == 0 or channels == 0:
         raise ValueError(f"{op}: weight must have shape [hidden, {channels} or more], got {list(weight.shape)}")
+    check_dtype(op, "weight", weight, FLOATING)
     check_features(op, "bev", bev, "weight", weight)
+    _check_precision(op, precision, "weight", weight)
     columns = weight[:, :channels]
     if not _native.use_native(op, bev):
-        return F.linear(bev.permute(0, 2, 3, 1), columns.to(bev.dtype)).permute(0, 3, 1, 2)
-    projected: Tensor = torch.ops.pred.project_bev(bev, columns)
+        return F.linear(bev.to(weight.dtype).permute(0, 2, 3, 1), columns).permute(0, 3, 1, 2)
+    with torch.autocast(bev.device.type, enabled=False):  # which would widen the map
+        projected: Tensor = torch.ops.pred.project_bev(bev.to(_storage(precision, weight)), columns)
     return projected
 
 
@@ -148,21 +153,31 @@ def decode_field(
     _native.refuse_transforms(OP)
     settings = _check(bev, points, weights, biases, point_range, frequencies, softplus_beta, sdf_scale, projected)
     check_flags(OP, with_gradient=with_gradient, projected=projected, recompute=recompute)
-    check_choice(OP, "precision", precision, ("fp32", "bf16"))
-    if precision == "bf16" and points.dtype != torch.float32:
-        raise TypeError(f"{OP}: precision must be 'fp32' with {points.dtype}, got 'bf16'")
+    _check_precision(OP, precision, "points", points)
     if not _native.use_native(OP, points):
         return _reference(bev, points, weights, biases, settings, with_gradient, projected)
+    with torch.autocast(points.device.type, enabled=False):
+        bev = bev.to(_storage(precision, points)) if projected else project_bev(bev, weights[0], precision)
+        return _compiled(bev, points, weights, biases, settings, with_gradient, recompute)
+
+
+def _compiled(
+    projected: Tensor,
+    points: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    settings: _Settings,
+    with_gradient: bool,
+    recompute: bool,
+) -> DecodedField:
     first = weights[0]
     channels = first.shape[1] - 3 - 6 * settings.frequencies
-    storage = torch.bfloat16 if precision == "bf16" else points.dtype
-    grid = bev.to(storage) if projected else project_bev(bev.to(storage), first)
     rows = [first[:, channels:], *weights[1:]]
     parameters = torch.cat([part.reshape(-1) for pair in zip(rows, biases, strict=True) for part in pair])
     widths = [first.shape[1] - channels, *(weight.shape[0] for weight in weights)]
-    learns = torch.is_grad_enabled() and (grid.requires_grad or points.requires_grad or parameters.requires_grad)
+    learns = torch.is_grad_enabled() and (projected.requires_grad or points.requires_grad or parameters.requires_grad)
     sdf, semantics, gradient, _, _ = torch.ops.pred.decode_field(
-        grid, points, parameters, widths, *settings, with_gradient, learns and not recompute
+        projected, points, parameters, widths, *settings, with_gradient, learns and not recompute
     )
     return DecodedField(sdf, semantics if widths[-1] > 1 else None, gradient if with_gradient else None)
 
@@ -210,9 +225,7 @@ def _check(
     check_dtype(OP, "points", points, FLOATING)
     if bev.shape[2] == 0 or bev.shape[3] == 0:
         raise ValueError(f"{OP}: bev must have at least one cell along each axis, got {list(bev.shape)}")
-    if bev.device != points.device:
-        raise ValueError(f"{OP}: bev must be on the device of points ({points.device}), got {bev.device}")
-    check_dtype(OP, "bev", bev, (points.dtype, *HALF) if points.dtype == torch.float32 else (points.dtype,))
+    check_features(OP, "bev", bev, "points", points)
     if not 2 <= len(weights) <= MAX_LAYERS:
         raise ValueError(f"{OP}: weights must be of 2 to {MAX_LAYERS} layers, got {len(weights)}")
     if len(biases) != len(weights):
@@ -245,6 +258,17 @@ def _check(
     if len(box) != 6 or not all(-math.inf < low < high < math.inf for low, high in zip(box, box[3:], strict=False)):
         raise ValueError(f"{OP}: point_range must be x, y, z of the lower, then of the upper corner, got {box}")
     return _Settings(box, frequencies, float(softplus_beta), float(sdf_scale))
+
+
+def _check_precision(op: str, precision: str, name: str, tensor: Tensor) -> None:
+    check_choice(op, "precision", precision, ("fp32", "bf16"))
+    if precision == "bf16" and tensor.dtype != torch.float32:
+        raise TypeError(f"{op}: precision must be 'fp32' where {name} is {tensor.dtype}, got 'bf16'")
+
+
+def _storage(precision: str, like: Tensor) -> torch.dtype:
+    """Dtype of the rows that are multiplied and kept."""
+    return torch.bfloat16 if precision == "bf16" else like.dtype
 
 
 # --- Reference -------------------------------------------------------------------------------------

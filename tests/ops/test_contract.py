@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -180,7 +181,7 @@ def test_wrong_tensors_are_named(backend: str, example: Example) -> None:
             wrong["rank"] = value[None, None, None]
         if len(tensors) > 1:
             wrong["device"] = value.to("meta")
-        names = "|".join(tensors)
+        names = "|".join(re.escape(name) for name in tensors)
         for what, replacement in wrong.items():
             for function in (example.native, example.reference):
                 with pytest.raises((ValueError, TypeError), match=rf"^{example.op}: ({names}) must .*, got ") as raised:

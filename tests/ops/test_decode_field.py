@@ -296,7 +296,7 @@ def test_errors(backend: str) -> None:
         call(softplus_beta=0)
     with pytest.raises(ValueError, match="decode_field: precision must be one of fp32, bf16, got 'fp16'"):
         call(precision="fp16")
-    with pytest.raises(TypeError, match="decode_field: precision must be 'fp32' with torch.float64, got 'bf16'"):
+    with pytest.raises(TypeError, match="decode_field: precision must be 'fp32' where points is torch.float64"):
         call(precision="bf16")
     with pytest.raises(ValueError, match="decode_field: frequencies must be at most 16, got 17"):
         call(frequencies=17)
