@@ -33,24 +33,17 @@ PRED_HOST_DEVICE SoftplusScale<T> softplus_scale(T beta) {
   return {exp_scale(beta), T(1) / beta};
 }
 
-// log(1 + exp(beta z)) / beta
-template <typename V, typename T>
-PRED_HOST_DEVICE V softplus(const SoftplusScale<T>& s, V z) {
-  const V positive = z < V{} ? V{} : z;  // NaN stays NaN
-  return positive + log1p_unit(exp_nonpositive(s.beta, negative_magnitude(z)).exp) * s.inverse;
-}
-
 template <typename V>
-struct Slope {
+struct Softplus {
+  V value;  // log(1 + exp(beta z)) / beta
   V slope;  // sigmoid(beta z)
-  V rest;   // 1 - slope
 };
 
-// From a = softplus(z) itself, with full relative accuracy on both sides: 1 - sigmoid(beta z) = exp(-beta a).
 template <typename V, typename T>
-PRED_HOST_DEVICE Slope<V> softplus_slope(const SoftplusScale<T>& s, V a) {
-  const Exp<V> e = exp_nonpositive(s.beta, -a);
-  return {-e.expm1, e.exp};
+PRED_HOST_DEVICE Softplus<V> softplus(const SoftplusScale<T>& s, V z) {
+  const V e = exp_nonpositive(s.beta, negative_magnitude(z)).exp, large = T(1) / (e + T(1));
+  const V positive = z < V{} ? V{} : z;  // NaN stays NaN
+  return {positive + log1p_unit(e) * s.inverse, z < V{} ? e * large : large};
 }
 
 struct SineCosine {

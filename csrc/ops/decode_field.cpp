@@ -170,7 +170,7 @@ struct Field {
   }
 };
 
-using Outputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Outputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor& parameters,
                      std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
@@ -185,7 +185,9 @@ Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor
     const int64_t layers = in.args.num_hidden;
     Tensor activation = torch::stable::new_empty(in.map, in.saved_shape(keep ? layers : 0));
     Tensor chain = torch::stable::new_empty(in.map, in.saved_shape(keep && with_gradient ? layers - 1 : 0));
+    Tensor slope = torch::stable::new_empty(in.map, in.saved_shape(keep ? layers : 0));
     const FieldSaved<S> saved{keep ? mutable_storage<S>(activation) : nullptr,
+                              keep ? mutable_storage<S>(slope) : nullptr,
                               keep && with_gradient ? mutable_storage<S>(chain) : nullptr};
     const FieldOutputs<S> out{sdf.mutable_data_ptr<T>(), semantics.mutable_data_ptr<T>(),
                               with_gradient ? gradient.mutable_data_ptr<T>() : nullptr};
@@ -197,14 +199,14 @@ Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor
       k.forward(in.args, saved, out, scratch.get(), first * kForwardGrain,
                 std::min(last * kForwardGrain, in.num_samples), in.num_samples);
     });
-    return Outputs(sdf, semantics, gradient, activation, chain);
+    return Outputs(sdf, semantics, gradient, activation, slope, chain);
   });
 }
 
 std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
     std::optional<Tensor> grad_sdf, std::optional<Tensor> grad_semantics, std::optional<Tensor> grad_gradient,
-    const Tensor& projected, const Tensor& points, const Tensor& parameters, const Tensor& activation_in,
-    const Tensor& chain_in, std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
+    const Tensor& projected, const Tensor& points, const Tensor& parameters, const Tensor& activation,
+    const Tensor& slope, const Tensor& chain, std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
     double sdf_scale, bool need_projected, bool need_points, bool need_parameters) {
   const char* op = "decode_field_backward";
   return PRED_DISPATCH_FIELD(op, projected.scalar_type(), [&] {
@@ -230,8 +232,11 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
       kept.push_back(torch::stable::contiguous(tensor));
       return mutable_storage<S>(kept.back());
     };
-    const FieldSaved<S> saved{saved_rows("activation", activation_in, in.args.num_hidden),
-                              saved_rows("chain", chain_in, in.args.num_hidden - 1)};
+    const FieldSaved<S> saved{saved_rows("activation", activation, in.args.num_hidden),
+                              saved_rows("slope", slope, in.args.num_hidden),
+                              saved_rows("chain", chain, in.args.num_hidden - 1)};
+    PRED_CHECK((saved.activation == nullptr) == (saved.slope == nullptr), op,
+               ": slope must be given with activation, got one of them");
 
     const int64_t width = in.args.map.channels, layers = in.args.num_hidden + 1;
     const auto rows = [&](bool wanted) {

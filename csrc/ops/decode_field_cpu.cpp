@@ -18,7 +18,7 @@ struct Tile {
   using T = Compute<S>;
   int64_t width, columns, stride, encoding_width, encoding_stride, output_stride, few_stride, angles, layers;
   S *encoding, *encoding_rate, *gathered, *output;
-  S *activation[kMaxHidden], *chain[kMaxHidden], *rate[kMaxHidden], *back[kMaxHidden];
+  S *activation[kMaxHidden], *slope[kMaxHidden], *chain[kMaxHidden], *rate[kMaxHidden], *back[kMaxHidden];
   S* interleaved[2];
   T *few, *few_chain;  // products with few columns
   T *sine, *cosine, *direction;
@@ -49,6 +49,7 @@ struct Tile {
     stencil = arena.take<LinearStencil<T, 2>>(kTile);
     for (int64_t l = 0; l < layers; ++l) {
       activation[l] = arena.take<S>(rows);
+      slope[l] = arena.take<S>(rows);
       chain[l] = arena.take<S>(rows);
     }
     if (backward) {
@@ -70,6 +71,7 @@ struct Tile {
   void use_saved(const FieldSaved<S>& saved, int64_t num_samples, int64_t begin, bool with_chain) {
     for (int64_t l = 0; l < layers; ++l) {
       activation[l] = saved.activation + (l * num_samples + begin) * stride;
+      slope[l] = saved.slope + (l * num_samples + begin) * stride;
       if (with_chain && l + 1 < layers) chain[l] = saved.chain + (l * num_samples + begin) * stride;
     }
   }
@@ -181,35 +183,33 @@ static void activations(const FieldArgs<S>& a, const Tile<S>& tile, int64_t coun
   const SoftplusScale<T> beta = tile.beta;
   for (int64_t l = 0; l < tile.layers; ++l) {
     const T* bias = a.bias[l];
-    S* out = tile.activation[l];
+    const S* gathered = l == 0 ? tile.gathered : nullptr;
+    S *out = tile.activation[l], *slope = tile.slope[l];
+    const auto epilogue = [=](int64_t row, int64_t column, Vec<T, W> sum) __attribute__((always_inline)) {
+      const int64_t at = row * stride + column;
+      const Vec<T, W> z = sum + load<W>(bias + column);
+      const auto a = softplus(beta, gathered ? z + load_values<W>(gathered + at) : z);
+      store_values<W>(out + at, a.value);
+      store_values<W>(slope + at, a.slope);
+    };
     if (l == 0) {
-      const S* gathered = tile.gathered;
-      product(tile.encoding, tile.encoding_stride, count, tile.encoding_width, a.up[0], tile.width,
-              [=](int64_t row, int64_t column, Vec<T, W> sum) __attribute__((always_inline)) {
-                const int64_t at = row * stride + column;
-                const Vec<T, W> z = sum + load<W>(bias + column) + load_values<W>(gathered + at);
-                store_values<W>(out + at, softplus(beta, z));
-              });
+      product(tile.encoding, tile.encoding_stride, count, tile.encoding_width, a.up[0], tile.width, epilogue);
     } else {
-      product(tile.activation[l - 1], stride, count, tile.width, a.up[l], tile.width,
-              [=](int64_t row, int64_t column, Vec<T, W> sum) __attribute__((always_inline)) {
-                store_values<W>(out + row * stride + column, softplus(beta, sum + load<W>(bias + column)));
-              });
+      product(tile.activation[l - 1], stride, count, tile.width, a.up[l], tile.width, epilogue);
     }
   }
 }
 
-// g_L from a_L.
+// g_L
 template <typename S, typename T = Compute<S>>
 static void last_of_chain(const FieldArgs<S>& a, const Tile<S>& tile, int64_t count) {
   constexpr int W = kWidth<T>;
-  const S* activation = tile.activation[tile.layers - 1];
+  const S* slope = tile.slope[tile.layers - 1];
   S* out = tile.chain[tile.layers - 1];
   for (int64_t r = 0; r < count; ++r) {
     for (int64_t c = 0; c < tile.columns; c += W) {
       const int64_t at = r * tile.stride + c;
-      store_values<W>(out + at,
-                      softplus_slope(tile.beta, load_values<W>(activation + at)).slope * load<W>(a.sdf_row + c));
+      store_values<W>(out + at, load_values<W>(slope + at) * load<W>(a.sdf_row + c));
     }
   }
 }
@@ -219,14 +219,13 @@ template <typename S, typename T = Compute<S>>
 static void chain(const FieldArgs<S>& a, const Tile<S>& tile, int64_t count) {
   constexpr int W = kWidth<T>;
   const int64_t stride = tile.stride;
-  const SoftplusScale<T> beta = tile.beta;
   for (int64_t l = tile.layers - 1; l > 0; --l) {
-    const S* activation = tile.activation[l - 1];
+    const S* slope = tile.slope[l - 1];
     S* out = tile.chain[l - 1];
     product(tile.chain[l], stride, count, tile.width, a.down[l], tile.width,
             [=](int64_t row, int64_t column, Vec<T, W> sum) __attribute__((always_inline)) {
               const int64_t at = row * stride + column;
-              store_values<W>(out + at, sum * softplus_slope(beta, load_values<W>(activation + at)).slope);
+              store_values<W>(out + at, sum * load_values<W>(slope + at));
             });
   }
 }
@@ -293,19 +292,18 @@ template <typename S, typename T = Compute<S>>
 static void tangents(const FieldArgs<S>& a, const Tile<S>& tile, int64_t begin, int64_t count) {
   constexpr int W = kWidth<T>;
   const int64_t stride = tile.stride;
-  const SoftplusScale<T> beta = tile.beta;
   const T beta_value = tile.beta_value;
   encode_rate(a, tile, count);
   gather<true>(a, tile, begin, count);
   for (int64_t l = 0; l < tile.layers; ++l) {
-    const S *activation = tile.activation[l], *chain = tile.chain[l], *gathered = l == 0 ? tile.gathered : nullptr;
+    const S *slope = tile.slope[l], *chain = tile.chain[l], *gathered = l == 0 ? tile.gathered : nullptr;
     S *rate = tile.rate[l], *back = tile.back[l];
     const auto epilogue = [=](int64_t row, int64_t column, Vec<T, W> sum) __attribute__((always_inline)) {
       const int64_t at = row * stride + column;
       const Vec<T, W> y = gathered ? sum + load_values<W>(gathered + at) : sum;
-      const auto s = softplus_slope(beta, load_values<W>(activation + at));
-      store_values<W>(rate + at, s.slope * y);
-      store_values<W>(back + at, load_values<W>(chain + at) * y * (s.rest * beta_value));
+      const Vec<T, W> s = load_values<W>(slope + at);
+      store_values<W>(rate + at, s * y);
+      store_values<W>(back + at, load_values<W>(chain + at) * y * (beta_value - beta_value * s));
     };
     if (l == 0) {
       product(tile.encoding_rate, tile.encoding_stride, count, tile.encoding_width, a.up[0], tile.width, epilogue);
@@ -320,13 +318,12 @@ template <typename S, typename T = Compute<S>>
 static void reverse(const FieldArgs<S>& a, const Tile<S>& tile, int64_t count, bool has_tangents) {
   constexpr int W = kWidth<T>;
   const int64_t stride = tile.stride;
-  const SoftplusScale<T> beta = tile.beta;
   for (int64_t l = tile.layers; l > 0; --l) {
-    const S* activation = tile.activation[l - 1];
+    const S* slope = tile.slope[l - 1];
     S* back = tile.back[l - 1];
     const auto epilogue = [=](int64_t row, int64_t column, Vec<T, W> sum) __attribute__((always_inline)) {
       const int64_t at = row * stride + column;
-      const Vec<T, W> x = sum * softplus_slope(beta, load_values<W>(activation + at)).slope;
+      const Vec<T, W> x = sum * load_values<W>(slope + at);
       store_values<W>(back + at, has_tangents ? x + load_values<W>(back + at) : x);
     };
     if (l == tile.layers) {

@@ -17,6 +17,7 @@ from pred import _native
 from pred.ops._check import (
     FLOATING,
     HALF,
+    as_geometry,
     check_choice,
     check_count,
     check_dtype,
@@ -26,8 +27,9 @@ from pred.ops._check import (
     check_number,
     check_shape,
     check_tensors,
+    widen,
 )
-from pred.ops.sample_bev import sample_bev
+from pred.ops.sample_bev import sample_bev_reference
 
 OP = "decode_field"
 MAX_LAYERS = 16
@@ -96,7 +98,7 @@ def project_bev(
     _check_precision(op, precision, "weight", weight)
     columns = weight[:, :channels]
     if not _native.use_native(op, bev):
-        return F.linear(bev.to(weight.dtype).permute(0, 2, 3, 1), columns).permute(0, 3, 1, 2)
+        return _project_reference(bev.to(weight.dtype), columns)
     with torch.autocast(bev.device.type, enabled=False):  # which would widen the map
         projected: Tensor = torch.ops.pred.project_bev(bev.to(_storage(precision, weight)), columns)
     return projected
@@ -127,7 +129,7 @@ def decode_field(
 
     Args:
         bev: ``[B, C, H, W]`` map, row = y, column = x, spanning the range box.
-        points: ``[B, N, 3]`` positions in metres in the map's frame, float32 or float64.
+        points: ``[B, N, 3]`` positions in metres in the map's frame, float32 or float64; half precision is widened.
         weights, biases: of the Linear layers, at least two; hidden layers have one width, in the dtype of ``points``.
         point_range: (x_min, y_min, z_min, x_max, y_max, z_max), metres.
         frequencies: F, octaves of the encoding.
@@ -137,8 +139,8 @@ def decode_field(
         projected: ``bev`` is :func:`project_bev` of the map, ``[B, hidden, H, W]``.
         precision: of products and of what is kept for the backward pass, for float32: ``"bf16"`` rounds their
             operands to bfloat16 and sums in float32; parameters and their gradients stay float32.
-        recompute: keep nothing for the backward pass but the arguments; else the activations of all hidden layers, and
-            with ``with_gradient`` as many rows but one again.
+        recompute: keep nothing for the backward pass but the arguments; else two rows per hidden layer and sample,
+            and with ``with_gradient`` a third one for all but the last.
 
     Returns:
         :class:`DecodedField` in the dtype of ``points``.
@@ -151,7 +153,9 @@ def decode_field(
     towards larger coordinates. Deterministic for any number of threads.
     """
     _native.refuse_transforms(OP)
-    settings = _check(bev, points, weights, biases, point_range, frequencies, softplus_beta, sdf_scale, projected)
+    points, weights, biases, settings = _arguments(
+        bev, points, weights, biases, point_range, frequencies, softplus_beta, sdf_scale, projected
+    )
     check_flags(OP, with_gradient=with_gradient, projected=projected, recompute=recompute)
     _check_precision(OP, precision, "points", points)
     if not _native.use_native(OP, points):
@@ -176,7 +180,7 @@ def _compiled(
     parameters = torch.cat([part.reshape(-1) for pair in zip(rows, biases, strict=True) for part in pair])
     widths = [first.shape[1] - channels, *(weight.shape[0] for weight in weights)]
     learns = torch.is_grad_enabled() and (projected.requires_grad or points.requires_grad or parameters.requires_grad)
-    sdf, semantics, gradient, _, _ = torch.ops.pred.decode_field(
+    sdf, semantics, gradient, *_ = torch.ops.pred.decode_field(
         projected, points, parameters, widths, *settings, with_gradient, learns and not recompute
     )
     return DecodedField(sdf, semantics if widths[-1] > 1 else None, gradient if with_gradient else None)
@@ -202,11 +206,15 @@ def decode_field_reference(
     Differentiable once, the gradient output included, as the compiled form; in the points as far as ``sdf`` and
     ``semantics`` go any number of times.
     """
-    settings = _check(bev, points, weights, biases, point_range, frequencies, softplus_beta, sdf_scale, projected)
+    points, weights, biases, settings = _arguments(
+        bev, points, weights, biases, point_range, frequencies, softplus_beta, sdf_scale, projected
+    )
+    check_flags(OP, with_gradient=with_gradient, projected=projected, recompute=recompute)
+    _check_precision(OP, precision, "points", points)
     return _reference(bev, points, weights, biases, settings, with_gradient, projected)
 
 
-def _check(
+def _arguments(
     bev: Tensor,
     points: Tensor,
     weights: Sequence[Tensor],
@@ -216,10 +224,13 @@ def _check(
     softplus_beta: float,
     sdf_scale: float,
     projected: bool,
-) -> _Settings:
+) -> tuple[Tensor, list[Tensor], list[Tensor], _Settings]:
+    """Checked; half-precision points are widened, and parameters in a half-precision region."""
     layers = {f"weights[{i}]": weight for i, weight in enumerate(weights)}
     layers |= {f"biases[{i}]": bias for i, bias in enumerate(biases)}
     check_tensors(OP, bev=bev, points=points, **layers)
+    points = as_geometry(points)
+    weights, biases = [widen(weight) for weight in weights], [widen(bias) for bias in biases]
     check_shape(OP, "bev", bev, ("B", "C", "H", "W"))
     check_shape(OP, "points", points, (bev.shape[0], "N", 3))
     check_dtype(OP, "points", points, FLOATING)
@@ -257,7 +268,7 @@ def _check(
     box = tuple(float(bound) for bound in point_range)
     if len(box) != 6 or not all(-math.inf < low < high < math.inf for low, high in zip(box, box[3:], strict=False)):
         raise ValueError(f"{OP}: point_range must be x, y, z of the lower, then of the upper corner, got {box}")
-    return _Settings(box, frequencies, float(softplus_beta), float(sdf_scale))
+    return points, weights, biases, _Settings(box, frequencies, float(softplus_beta), float(sdf_scale))
 
 
 def _check_precision(op: str, precision: str, name: str, tensor: Tensor) -> None:
@@ -292,7 +303,7 @@ def _reference(
     position = (points - centre) / half_extent
     encoding = encode(position, settings.frequencies)
     bev = bev.to(points.dtype)
-    grid_map = bev if projected else project_bev(bev, weights[0])
+    grid_map = bev if projected else _project_reference(bev, weights[0][:, : bev.shape[1]])
 
     if with_gradient:
         # Sampling needs its graph for d feature / d point even where gradients are off.
@@ -300,9 +311,9 @@ def _reference(
             grid = position[..., :2]
             if not grid.requires_grad:
                 grid = grid.detach().requires_grad_()
-            sampled = sample_bev(grid_map, grid)
+            sampled = sample_bev_reference(grid_map, grid)
     else:
-        sampled = sample_bev(grid_map, position[..., :2])
+        sampled = sample_bev_reference(grid_map, position[..., :2])
 
     columns = weights[0][:, weights[0].shape[1] - encoding.shape[-1] :]
     activation = sampled + F.linear(encoding, columns, biases[0])
@@ -327,6 +338,10 @@ def _reference(
         gradient = (by_position + F.pad(by_grid, (0, 1))) / half_extent
     semantics = output[..., 1:] if output.shape[-1] > 1 else None
     return DecodedField(output[..., 0] * settings.sdf_scale, semantics, gradient)
+
+
+def _project_reference(bev: Tensor, weight: Tensor) -> Tensor:
+    return F.linear(bev.permute(0, 2, 3, 1), weight).permute(0, 3, 1, 2)
 
 
 def _encoding_gradient(by_encoding: Tensor, encoding: Tensor, frequencies: int) -> Tensor:
@@ -413,6 +428,7 @@ def _fake(
         points.new_empty(frames, count, widths[-1] - 1),
         points.new_empty(frames, count if with_gradient else 0, 3),
         projected.new_empty(hidden if keep else 0, rows, stride),
+        projected.new_empty(hidden if keep else 0, rows, stride),
         projected.new_empty(hidden - 1 if keep and with_gradient else 0, rows, stride),
     )
 
@@ -420,21 +436,20 @@ def _fake(
 def _save(ctx: Any, inputs: Any, output: Any) -> None:
     projected, points, parameters, *settings, ctx.with_gradient, _ = inputs
     ctx.settings = settings
-    ctx.save_for_backward(projected, points, parameters, output[3], output[4])
-    ctx.mark_non_differentiable(output[3], output[4])
+    ctx.save_for_backward(projected, points, parameters, *output[3:])
+    ctx.mark_non_differentiable(*output[3:])
     ctx.set_materialize_grads(False)
 
 
 def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
-    sdf, semantics, gradient, _, _ = grads
-    projected, points, parameters, activation, chain = ctx.saved_tensors
+    sdf, semantics, gradient, *_ = grads
     none = (None,) * 7
     if sdf is None and semantics is None and gradient is None:
         return (None, None, None, *none)
     need = ctx.needs_input_grad
     found = torch.ops.pred.decode_field_backward(
-        sdf, semantics, gradient if ctx.with_gradient else None, projected, points, parameters, activation, chain,
-        *ctx.settings, need[0], need[1], need[2],
+        sdf, semantics, gradient if ctx.with_gradient else None, *ctx.saved_tensors, *ctx.settings,
+        need[0], need[1], need[2],
     )  # fmt: skip
     return (*(value if wanted else None for value, wanted in zip(found, need, strict=False)), *none)
 
@@ -447,6 +462,7 @@ def _backward_fake(
     points: Tensor,
     parameters: Tensor,
     activation: Tensor,
+    slope: Tensor,
     chain: Tensor,
     widths: Sequence[int],
     point_range: Sequence[float],

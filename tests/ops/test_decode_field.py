@@ -313,6 +313,6 @@ def test_direct_calls_are_checked(native: None) -> None:
         call(bev, points, parameters, [9, 16, 1], *settings[1:], True, True)
     with pytest.raises(KERNEL_ERROR, match=r"decode_field_backward: grad_sdf must have shape \[1, 5\], got \[1, 4\]"):
         torch.ops.pred.decode_field_backward(
-            points[:, 1:, 0], None, None, bev, points, parameters, torch.zeros(0, 5, 32), torch.zeros(0, 5, 32),
-            *settings, True, True, True,
+            points[:, 1:, 0], None, None, bev, points, parameters, *[torch.zeros(0, 5, 32)] * 3, *settings,
+            True, True, True,
         )  # fmt: skip
