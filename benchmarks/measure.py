@@ -232,6 +232,7 @@ def machine_record() -> dict[str, Any]:
             name: value
             for name, value in sorted(os.environ.items())
             if name.startswith(("PRED_", "MALLOC_", "OMP_", "GOMP_", "MKL_", "KMP_", "ATEN_", "TORCHINDUCTOR_", "LD_P"))
+            and not name.endswith("_DIR")  # changes no time
         },
     }
 

@@ -173,6 +173,8 @@ def register(
             return fake(*arguments)
         except IndexError as error:
             raise ValueError(f"{op}: an argument has the wrong number of dimensions ({error})") from None
+        except AttributeError as error:
+            raise TypeError(f"{op}: an argument is None in place of a tensor ({error})") from None
 
     torch.library.register_fake(name, checked_fake)
 

@@ -161,6 +161,12 @@ def test_pure_python_package_works(tmp_path: Path) -> None:
     assert "PRED_BACKEND=native, but the compiled kernels are missing (the package was never built)" in failing.stderr
 
 
+def test_none_in_place_of_a_tensor_is_named(native: None) -> None:
+    index = torch.empty(0, dtype=torch.int64, device="meta")
+    with pytest.raises(TypeError, match="segment_reduce: an argument is None in place of a tensor"):
+        torch.ops.pred.segment_reduce(None, index, 50, "mean")
+
+
 def test_any_number_of_empty_rays(native: None) -> None:
     assert torch.ops.pred.sdf_to_alpha(torch.empty(2**62, 0), torch.tensor(2.7), False, None).shape == (2**62, 0)
 
@@ -171,6 +177,8 @@ def test_sizes_whose_products_overflow_are_refused(native: None) -> None:
     with pytest.raises(KERNEL_ERROR, match=r"composite_alpha: values must have fewer than 2\^31 channels, got 2305843"):
         values = torch.empty(3, 0, 2**61)
         torch.ops.pred.composite_alpha(torch.zeros(3, 0), None, values, None, 0.0, False)
+    with pytest.raises(KERNEL_ERROR, match=r"voxelize_hard_backward: grad must have fewer than 2\^63 slots, got shape"):
+        torch.ops.pred.voxelize_hard_backward(torch.empty(2**62, 2, 0), torch.tensor([0, -1]))
     with pytest.raises(KERNEL_ERROR, match=r"voxelize_hard: max_points must be less than 2\^63 / C with C=4, got 23"):
         grid = ([0.1] * 3, [0.0] * 3 + [1.0] * 3, [10] * 3)
         torch.ops.pred.voxelize_hard(torch.zeros(0, 4), torch.tensor([0, 0]), *grid, 2**61, 1)

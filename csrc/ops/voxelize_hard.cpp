@@ -139,7 +139,9 @@ Tensor voxelize_hard_backward(const Tensor& grad_in, const Tensor& point_to_slot
   const Tensor point_to_slot = torch::stable::contiguous(point_to_slot_in);
   const int64_t* slot_of = point_to_slot.const_data_ptr<int64_t>();
   const int64_t num_points = point_to_slot.size(0), columns = grad.size(2);
-  const int64_t num_slots = grad.size(0) * grad.size(1);
+  int64_t num_slots;
+  PRED_CHECK(!__builtin_mul_overflow(grad.size(0), grad.size(1), &num_slots), op,
+             ": grad must have fewer than 2^63 slots, got shape ", shape_text(grad));
   parallel(num_points, 32768, [&](int64_t begin, int64_t end) {
     for (int64_t row = begin; row < end; ++row) {
       PRED_CHECK(slot_of[row] < num_slots, op, ": point_to_slot must be less than ", num_slots, ", got ", slot_of[row]);
