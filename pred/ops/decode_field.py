@@ -153,14 +153,14 @@ def decode_field(
     towards larger coordinates. Deterministic for any number of threads.
     """
     _native.refuse_transforms(OP)
+    check_flags(OP, with_gradient=with_gradient, projected=projected, recompute=recompute)
     points, weights, biases, settings = _arguments(
         bev, points, weights, biases, point_range, frequencies, softplus_beta, sdf_scale, projected
     )
-    check_flags(OP, with_gradient=with_gradient, projected=projected, recompute=recompute)
     _check_precision(OP, precision, "points", points)
-    if not _native.use_native(OP, points):
-        return _reference(bev, points, weights, biases, settings, with_gradient, projected)
     with torch.autocast(points.device.type, enabled=False):
+        if not _native.use_native(OP, points):
+            return _reference(bev, points, weights, biases, settings, with_gradient, projected)
         bev = bev.to(_storage(precision, points)) if projected else project_bev(bev, weights[0], precision)
         return _compiled(bev, points, weights, biases, settings, with_gradient, recompute)
 
@@ -206,12 +206,13 @@ def decode_field_reference(
     Differentiable once, the gradient output included, as the compiled form; in the points as far as ``sdf`` and
     ``semantics`` go any number of times.
     """
+    check_flags(OP, with_gradient=with_gradient, projected=projected, recompute=recompute)
     points, weights, biases, settings = _arguments(
         bev, points, weights, biases, point_range, frequencies, softplus_beta, sdf_scale, projected
     )
-    check_flags(OP, with_gradient=with_gradient, projected=projected, recompute=recompute)
     _check_precision(OP, precision, "points", points)
-    return _reference(bev, points, weights, biases, settings, with_gradient, projected)
+    with torch.autocast(points.device.type, enabled=False):
+        return _reference(bev, points, weights, biases, settings, with_gradient, projected)
 
 
 def _arguments(
