@@ -12,6 +12,7 @@ import torch._dynamo.testing
 from torch import Tensor
 
 from pred.ops import reference, sdf_to_alpha
+from tests.ops.published import published_section
 from tests.ops.two_samples import TWO_SAMPLES
 from tests.tolerances import FORWARD, GRADIENT, assert_close, of_rounded_distances
 
@@ -177,16 +178,6 @@ def test_packed_without_samples(backend: str, counts: list[int]) -> None:
 
 
 # --- sections and densities ------------------------------------------------------------------------------------------
-
-
-def published_section(
-    sdf: Tensor, inv_s: Tensor, cosine: Tensor, length: Tensor, cos_anneal: float, eps: float
-) -> Tensor:
-    """NeuS's opacity, written out from its paper and supplement; UniPAD's is the same."""
-    falling = -(torch.relu(-cosine * 0.5 + 0.5) * (1.0 - cos_anneal) + torch.relu(-cosine) * cos_anneal)
-    prev_cdf = torch.sigmoid((sdf - falling * length * 0.5) * inv_s)
-    next_cdf = torch.sigmoid((sdf + falling * length * 0.5) * inv_s)
-    return ((prev_cdf - next_cdf + eps) / (prev_cdf + eps)).clip(0.0, 1.0)
 
 
 def sections(
