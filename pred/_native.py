@@ -174,6 +174,8 @@ def register(
         except IndexError as error:
             raise ValueError(f"{op}: an argument has the wrong number of dimensions ({error})") from None
         except AttributeError as error:
+            if "'NoneType' object" not in str(error):
+                raise
             raise TypeError(f"{op}: an argument is None in place of a tensor ({error})") from None
 
     torch.library.register_fake(name, checked_fake)

@@ -14,6 +14,7 @@
 #include <utility>
 #include <vector>
 
+#include "common/allocate.h"
 #include "common/check.h"
 #include "common/parallel.h"
 
@@ -46,7 +47,7 @@ SortedItems<Item> sort_rows(int64_t num_rows, int row_bits, int key_bits, const 
   int64_t num_blocks = (num_rows + kBlock - 1) / kBlock;
   num_blocks = num_blocks < 1 ? 1 : num_blocks > kMaxBlocks ? kMaxBlocks : num_blocks;
 
-  std::unique_ptr<Item[]> from(new Item[num_rows]), to(new Item[num_rows]);
+  std::unique_ptr<Item[]> from = allocate_array<Item>(num_rows), to = allocate_array<Item>(num_rows);
   std::vector<int64_t> begin(num_blocks + 1), end(num_blocks);
   for (int64_t block = 0; block <= num_blocks; ++block) begin[block] = num_rows * block / num_blocks;
   parallel(num_blocks, 1, [&](int64_t first, int64_t last) {

@@ -8,6 +8,7 @@
 #include <algorithm>
 #include <memory>
 
+#include "common/allocate.h"
 #include "ops/point_forest.h"
 
 namespace pred {
@@ -20,11 +21,11 @@ void sample_frame(const PointForest<T>& forest, int64_t frame, const T* xyz, int
                   int64_t* out) {
   const PointTree<T>& tree = forest[frame];
   FarthestPointScratch<T> scratch{};
-  const std::unique_ptr<T[]> distance(new T[forest.num_leaves(frame) * kLeafPoints]);
+  const std::unique_ptr<T[]> distance = allocate_array<T>(forest.num_leaves(frame) * kLeafPoints);
   scratch.distance = distance.get();
   std::unique_ptr<T[]> largest[kTreeLevels];
   for (int level = 0; level < tree.num_levels; ++level) {
-    largest[level].reset(new T[forest.num_groups(frame, level) * kTreeFan]);
+    largest[level] = allocate_array<T>(forest.num_groups(frame, level) * kTreeFan);
     scratch.largest[level] = largest[level].get();
   }
   kernels<T>().sample(tree, scratch, xyz, forest.num_leaves(frame), first, num_samples, out);

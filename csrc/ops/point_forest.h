@@ -13,6 +13,7 @@
 #include <memory>
 #include <vector>
 
+#include "common/allocate.h"
 #include "common/check.h"
 #include "common/clouds.h"
 #include "common/parallel.h"
@@ -70,8 +71,8 @@ class PointForest {
   static int64_t groups_of(int64_t count, int64_t size) { return (count + size - 1) / size; }
 
   void read_points(const T* xyz, const int64_t* offset, int64_t num_frames) {
-    points_.reset(new Point[offset[num_frames]]);
-    spare_.reset(new Point[offset[num_frames]]);
+    points_ = allocate_array<Point>(offset[num_frames]);
+    spare_ = allocate_array<Point>(offset[num_frames]);
     begin_.assign(num_frames + 1, 0);
     int64_t count = 0;
     for (int64_t frame = 0; frame < num_frames; ++frame) {
@@ -164,10 +165,10 @@ class PointForest {
       num_leaves += this->num_leaves(frame);
       for (int level = 0; level < trees_[frame].num_levels; ++level) num_groups += this->num_groups(frame, level);
     }
-    leaf_points_.reset(new T[num_leaves * 3 * kLeafPoints]);
-    leaf_rows_.reset(new int32_t[num_leaves * kLeafPoints]);
-    boxes_.reset(new T[num_groups * 6 * kTreeFan]);
-    first_rows_.reset(new int32_t[num_groups * kTreeFan]);
+    leaf_points_ = allocate_array<T>(num_leaves * 3 * kLeafPoints);
+    leaf_rows_ = allocate_array<int32_t>(num_leaves * kLeafPoints);
+    boxes_ = allocate_array<T>(num_groups * 6 * kTreeFan);
+    first_rows_ = allocate_array<int32_t>(num_groups * kTreeFan);
     num_leaves = num_groups = 0;
     for (int64_t frame = 0; frame < int64_t(trees_.size()); ++frame) {
       PointTree<T>& tree = trees_[frame];

@@ -98,11 +98,11 @@ static inline void merge(int64_t num_new, const Row<T>& row) {
   int64_t begin = 0;  // c_i
   for (int64_t i = 0; i < row.sections; ++i) {
     const int64_t end = row.low[i] > begin ? row.low[i] : begin;
-    for (int64_t k = begin - 1; k < end; k += W) {
+    row.out[i + begin] = row.t[i];
+    for (int64_t k = begin; k < end; k += W) {
       store(row.out + i + 1 + k, interpolate(load<W>(row.u + k), splat<W>(row.cdf[i]), splat<W>(row.slope[i]),
                                              splat<W>(row.t[i]), splat<W>(row.t[i + 1])));
     }
-    row.out[i + begin] = row.t[i];  // in place of the sample before it
     begin = end;
   }
   row.out[row.sections + num_new] = row.t[row.sections];

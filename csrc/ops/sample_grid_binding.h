@@ -17,6 +17,7 @@
 #include <tuple>
 #include <vector>
 
+#include "common/allocate.h"
 #include "common/check.h"
 #include "common/parallel.h"
 #include "common/radix_sort.h"
@@ -64,7 +65,9 @@ struct SampleGrid {
       }
       args.border = border;
       args.align_corners = align_corners;
-      zeros.reset(new S[num_samples() > 0 ? args.channels : 0]());
+      const int64_t num_zeros = num_samples() > 0 ? args.channels : 0;
+      zeros = allocate_array<S>(num_zeros);
+      std::fill_n(zeros.get(), num_zeros, S());
       args.zeros = zeros.get();
     }
 
@@ -222,7 +225,7 @@ struct SampleGrid {
     S* out = mutable_storage<S>(grad_map);
     parallel(batch * num_bands, 1, [&](int64_t begin, int64_t end) {
       std::unique_ptr<Compute<S>[]> sums;
-      if (!std::is_same_v<S, Compute<S>>) sums.reset(new Compute<S>[depth * kBandRows * a.stride[1]]);
+      if (!std::is_same_v<S, Compute<S>>) sums = allocate_array<Compute<S>>(depth * kBandRows * a.stride[1]);
       for (int64_t task = begin; task < end; ++task) {
         SampleGridBand<S> band{task / num_bands, task % num_bands * kBandRows, 0, 0, 0, sums.get()};
         band.end = std::min(band.begin + kBandRows, height);

@@ -10,6 +10,7 @@
 #include <string>
 #include <tuple>
 
+#include "common/allocate.h"
 #include "common/check.h"
 #include "common/parallel.h"
 
@@ -57,7 +58,8 @@ std::tuple<Tensor, Tensor> forward(const char* op, const Tensor& features_in, co
                      ? torch::stable::new_empty(index, {num_segments}, ScalarType::Int)
                      : torch::stable::new_empty(index, {num_segments, channels}, ScalarType::Int);
   const SegmentReduceArgs<S> a{storage<S>(features), index.const_data_ptr<int64_t>(), num_rows, channels};
-  const std::unique_ptr<T[]> wide(std::is_same_v<S, T> ? nullptr : new T[num_segments * channels]);
+  std::unique_ptr<T[]> wide;
+  if (!std::is_same_v<S, T>) wide = allocate_array<T>(num_segments * channels);
   T* results = wide ? wide.get() : static_cast<T*>(out.mutable_data_ptr());
   int32_t* saved_data = saved.mutable_data_ptr<int32_t>();
   // Each task reads the whole index: no more tasks than there is work for.

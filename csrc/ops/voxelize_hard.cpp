@@ -10,6 +10,7 @@
 #include <tuple>
 #include <vector>
 
+#include "common/allocate.h"
 #include "ops/voxelize_sort.h"
 
 namespace pred {
@@ -81,7 +82,7 @@ Outputs fill_voxels(const VoxelizeInputs& in, const Tensor& points, const Sorted
   const VoxelizeHardArgs<M, Item> a{sorted.items.get(), sorted.count, in.bits, storage<M>(points), columns, max_points};
   int64_t* slot_of = point_to_slot.mutable_data_ptr<int64_t>();
 
-  std::unique_ptr<int32_t[]> run_of_row(new int32_t[num_points]);
+  std::unique_ptr<int32_t[]> run_of_row = allocate_array<int32_t>(num_points);
   parallel(num_points, 32768, [&](int64_t begin, int64_t end) {
     std::fill(run_of_row.get() + begin, run_of_row.get() + end, -1);
     std::fill(slot_of + begin, slot_of + end, -1);
@@ -96,7 +97,7 @@ Outputs fill_voxels(const VoxelizeInputs& in, const Tensor& points, const Sorted
   };
   for_each_piece([&](Piece& p) { p.num_voxels = k.count_runs(run_of_row.get(), p.begin, p.end); });
   const int64_t num_voxels = number_voxels(pieces, max_voxels);
-  std::unique_ptr<int32_t[]> run_of_voxel(new int32_t[num_voxels]);
+  std::unique_ptr<int32_t[]> run_of_voxel = allocate_array<int32_t>(num_voxels);
   for_each_piece([&](const Piece& p) {
     k.gather_runs(run_of_row.get(), p.begin, p.end, p.num_voxels, run_of_voxel.get() + p.first_voxel);
   });

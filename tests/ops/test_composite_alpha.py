@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pred.ops import composite_alpha, reference, sdf_to_alpha
 from pred.ops.composite_rays import composite_rays
+from tests.ops.published import published_weights
 from tests.tolerances import FORWARD, GRADIENT, assert_close
 
 OUTPUTS = ("weights", "depth", "opacity", "values")
@@ -121,8 +122,7 @@ def test_transmittance_eps(backend: str) -> None:
 def test_neus_in_its_own_words(backend: str) -> None:
     """weights = alpha * cumprod([1, 1 - alpha + 1e-7])[:-1], in float32 as there."""
     alpha, _, _ = case(7, 96, dtype=torch.float32)
-    ones = torch.ones(7, 1)
-    expected = alpha * torch.cumprod(torch.cat([ones, 1.0 - alpha + 1e-7], dim=-1), dim=-1)[:, :-1]
+    expected = published_weights(alpha)
     out = composite_alpha(alpha, transmittance_eps=1e-7)
     assert_close(out.weights, expected, FORWARD[torch.float32])
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pred.ops import Composite, composite_rays, reference
+from tests.ops.two_samples import TWO_SAMPLES, sigmoid
 from tests.tolerances import FORWARD, GRADIENT, assert_close, of_rounded_distances
 
 OUTPUTS = ("weights", "depth", "opacity", "values")
@@ -113,36 +114,6 @@ def test_sharp_surfaces_stay_finite(backend: str, sharp: float, dtype: torch.dty
         if section is not None:
             expected[section] = 1.0
         assert (weights - expected).abs().max() <= 1e-6
-
-
-def sigmoid(x: float) -> float:
-    return 1 / (1 + math.exp(-x))
-
-
-# (d_0, d_1, s, opacity, d opacity / d d_0, d opacity / d d_1) of a ray of two samples, by its definition
-# 1 - Phi(d_1) / Phi(d_0), whose derivatives are s ratio (1 - Phi) of either end; far inside Phi(d) is exp(s d).
-TWO_SAMPLES = {
-    "falling, inside": (-2.0, -2.1, 64.0, 1 - math.exp(-6.4), 64 * math.exp(-6.4), -64 * math.exp(-6.4)),
-    "rising, inside": (-3.0, -2.9, 64.0, 0.0, 0.0, 0.0),
-    "nearly flat, inside": (
-        -1.0,
-        -1.0001,
-        64.0,
-        1 - math.exp(-0.0064),
-        64 * math.exp(-0.0064),
-        -64 * math.exp(-0.0064),
-    ),
-    "small crossing": (
-        0.3,
-        0.29,
-        20.0,
-        1 - sigmoid(5.8) / sigmoid(6),
-        20 * sigmoid(5.8) / sigmoid(6) * sigmoid(-6),
-        -20 * sigmoid(5.8) / sigmoid(6) * sigmoid(-5.8),
-    ),
-    "tie": (0.5, 0.5, 64.0, 0.0, 0.0, 0.0),
-    "free space": (10.0, 9.0, 64.0, 0.0, 0.0, 0.0),
-}
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

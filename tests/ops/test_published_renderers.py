@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole compositing of NeuS and UniPAD, from distances to what is rendered, as their codes publish it.
 
-Both sides get the same numbers. The published one is written out here in plain PyTorch, with its constants, clips and
-order of operations, and runs in float64; ours is :func:`pred.ops.sdf_to_alpha` and :func:`pred.ops.composite_alpha`.
+Both sides get the same numbers. The published one is written out here and in published.py, and runs in float64; ours is
+:func:`pred.ops.sdf_to_alpha` and :func:`pred.ops.composite_alpha`.
 Errors are norm-wise: the largest difference of a result or gradient, over its largest element in the whole batch. In
 float64 they are at most 1e-12, but for two gradients of UniPAD's rays that miss the sphere (``MISSING_DEPTH``). In
 float32 they are at most 1e-5; for the kinds of rays in ``CANCELLING`` a result or gradient that the published code in
@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pred.ops import composite_alpha, sdf_to_alpha
+from tests.ops.published import published_section, published_weights
 from tests.tolerances import assert_close, relative_error
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
@@ -32,18 +33,9 @@ Render = Callable[..., dict[str, Tensor]]
 def published_alpha(
     sdf: Tensor, gradient: Tensor, direction: Tensor, length: Tensor, variance: Tensor, cos_anneal: float
 ) -> Tensor:  # [R, S]
-    """NeuS, and UniPAD's ``get_alpha``. They differ in where on the section ``sdf`` is read."""
     inv_s = torch.exp(variance * 10.0).clip(1e-6, 1e6)
     true_cos = (direction[:, None] * gradient).sum(-1)
-    iter_cos = -(F.relu(-true_cos * 0.5 + 0.5) * (1.0 - cos_anneal) + F.relu(-true_cos) * cos_anneal)
-    prev_cdf = torch.sigmoid((sdf - iter_cos * length * 0.5) * inv_s)
-    next_cdf = torch.sigmoid((sdf + iter_cos * length * 0.5) * inv_s)
-    return ((prev_cdf - next_cdf + 1e-5) / (prev_cdf + 1e-5)).clip(0.0, 1.0)
-
-
-def published_weights(alpha: Tensor) -> Tensor:  # [R, S]
-    ones = torch.ones_like(alpha[:, :1])
-    return alpha * torch.cumprod(torch.cat([ones, 1.0 - alpha + 1e-7], -1), -1)[:, :-1]
+    return published_section(sdf, inv_s, true_cos, length, cos_anneal, 1e-5)
 
 
 def neus(

@@ -12,11 +12,9 @@ import torch._dynamo.testing
 from torch import Tensor
 
 from pred.ops import reference, sdf_to_alpha
+from tests.ops.published import published_section
+from tests.ops.two_samples import TWO_SAMPLES
 from tests.tolerances import FORWARD, GRADIENT, assert_close, of_rounded_distances
-
-
-def sigmoid(x: float) -> float:
-    return 1 / (1 + math.exp(-x)) if x > -700 else 0.0
 
 
 def rays(num_rays: int = 7, samples: int = 33, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -26,38 +24,10 @@ def rays(num_rays: int = 7, samples: int = 33, dtype: torch.dtype = torch.float6
     return (2 - steps.cumsum(dim=1) * 0.3 - 0.1 * torch.arange(samples)).to(dtype)
 
 
-# (d_i, d_i+1, s, alpha, d alpha / d d_i, d alpha / d d_i+1), by the definition 1 - Phi(d_i+1) / Phi(d_i), derivatives
-# s ratio (1 - Phi) of either end, and, where that is 0 / 0 in floating point, by its limit 1 - exp(s (d_i+1 - d_i)).
-CASES = {
-    "crossing": (1.0, -1.0, 1.0, 1 - math.exp(-1), math.exp(-1) * sigmoid(-1), -sigmoid(-1)),
-    "deep inside, falling": (-2.0, -2.1, 64.0, 1 - math.exp(-6.4), 64 * math.exp(-6.4), -64 * math.exp(-6.4)),
-    "inside, rising": (-3.0, -2.9, 64.0, 0.0, 0.0, 0.0),
-    "inside, nearly flat": (
-        -1.0,
-        -1.0001,
-        64.0,
-        1 - math.exp(-0.0064),
-        64 * math.exp(-0.0064),
-        -64 * math.exp(-0.0064),
-    ),
-    "free space": (10.0, 9.9, 64.0, 0.0, 0.0, 0.0),
-    "small crossing": (
-        0.3,
-        0.29,
-        20.0,
-        1 - sigmoid(5.8) / sigmoid(6),
-        20 * sigmoid(5.8) / sigmoid(6) * sigmoid(-6),
-        -20 * sigmoid(5.8) / sigmoid(6) * sigmoid(-5.8),
-    ),
-    "tie": (0.5, 0.5, 64.0, 0.0, 0.0, 0.0),
-    "opaque": (7.8125, -7.8125, 64.0, 1.0, 0.0, 0.0),
-}
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", TWO_SAMPLES)
 def test_hand_computed(backend: str, name: str, dtype: torch.dtype) -> None:
-    before, after, inv_s, alpha, grad_before, grad_after = CASES[name]
+    before, after, inv_s, alpha, grad_before, grad_after = TWO_SAMPLES[name]
     sdf = torch.tensor([[before, after]], dtype=dtype, requires_grad=True)
     out = sdf_to_alpha(sdf, inv_s)
     out.sum().backward()
@@ -208,16 +178,6 @@ def test_packed_without_samples(backend: str, counts: list[int]) -> None:
 
 
 # --- sections and densities ------------------------------------------------------------------------------------------
-
-
-def published_section(
-    sdf: Tensor, inv_s: Tensor, cosine: Tensor, length: Tensor, cos_anneal: float, eps: float
-) -> Tensor:
-    """NeuS's opacity, written out from its paper and supplement; UniPAD's is the same."""
-    falling = -(torch.relu(-cosine * 0.5 + 0.5) * (1.0 - cos_anneal) + torch.relu(-cosine) * cos_anneal)
-    prev_cdf = torch.sigmoid((sdf - falling * length * 0.5) * inv_s)
-    next_cdf = torch.sigmoid((sdf + falling * length * 0.5) * inv_s)
-    return ((prev_cdf - next_cdf + eps) / (prev_cdf + eps)).clip(0.0, 1.0)
 
 
 def sections(

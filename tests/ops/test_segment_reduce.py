@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+import resource
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+from benchmarks import memory
 from pred.ops import reference, segment_reduce
-from tests.conftest import KERNEL_ERROR
+from tests.conftest import KERNEL_ERROR, SANITIZED
 from tests.tolerances import FORWARD, GRADIENT, assert_close
 
 REDUCTIONS = ("sum", "mean", "max")
@@ -212,3 +215,20 @@ def test_direct_calls_are_checked(native: None) -> None:
         backward(features[:11], torch.full((4,), 11), torch.empty(0, dtype=torch.int32), "sum")
     with pytest.raises(KERNEL_ERROR, match=r"saved must belong to grad of shape \[12, 5\], got \[12, 4\]"):
         backward(features[:12], index, torch.zeros(12, 4, dtype=torch.int32), "max")
+
+
+@pytest.fixture
+def _ten_more_gibibytes() -> Iterator[None]:
+    """Of address space; with the sanitizers, which take terabytes of it, 4 GiB per allocation (Makefile)."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    if not SANITIZED:
+        resource.setrlimit(resource.RLIMIT_AS, (memory.status_bytes("VmSize") + (10 << 30), hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def test_scratch_that_does_not_fit(native: None, _ten_more_gibibytes: None) -> None:
+    """The 2^31 bfloat16 of the result fit, their 8 GiB of float32 sums do not."""
+    features, index = torch.empty(0, 1, dtype=torch.bfloat16), torch.empty(0, dtype=torch.int64)
+    with pytest.raises(MemoryError):
+        segment_reduce(features, index, 1 << 31)
