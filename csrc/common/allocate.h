@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <memory>
 #include <new>
@@ -18,5 +19,28 @@ std::unique_ptr<T[]> allocate_array(int64_t count) {
   if (!memory) throw std::bad_alloc();
   return memory;
 }
+
+template <typename T>
+std::unique_ptr<T[]> allocate_zeros(int64_t count) {
+  std::unique_ptr<T[]> memory = allocate_array<T>(count);
+  std::fill_n(memory.get(), count, T{});
+  return memory;
+}
+
+// Gives out pieces of a block of memory, which has to have kAlignment bytes more than they; from null, only `at` is of
+// use, their total size.
+struct Arena {
+  static constexpr int64_t kAlignment = 64;
+  uintptr_t at;
+
+  explicit Arena(char* memory) : at(uintptr_t(memory)) {}
+
+  template <typename T>
+  T* take(int64_t count) {
+    const uintptr_t begin = (at + kAlignment - 1) / kAlignment * kAlignment;
+    at = begin + uintptr_t(count) * sizeof(T);
+    return (T*)begin;
+  }
+};
 
 }  // namespace pred

@@ -21,18 +21,6 @@ constexpr int kTileRows = 12;  // 24 of 32 registers accumulate
 constexpr int kTileRows = 6;  // 12 of 16
 #endif
 
-// Gives out pieces of a block of memory; from null, only their total size is of use.
-struct Arena {
-  uintptr_t at;
-
-  template <typename X>
-  X* take(int64_t count) {
-    const uintptr_t begin = (at + 63) / 64 * 64;
-    at = begin + uintptr_t(count) * sizeof(X);
-    return (X*)begin;
-  }
-};
-
 template <typename S>
 constexpr int kPair = std::is_same_v<S, BFloat16> ? 2 : 1;
 

@@ -11,8 +11,9 @@
 #include <tuple>
 #include <vector>
 
+#include "common/allocate.h"
+#include "common/blocks.h"
 #include "common/check.h"
-#include "common/parallel.h"
 #include "ops/sample_bev.h"
 
 namespace pred {
@@ -28,12 +29,6 @@ const FieldKernels<S>& field_kernels() {
     return PRED_KERNELS(decode_field_bf16);
 }
 
-// Samples per task of the forward pass.
-constexpr int64_t kForwardGrain = 960;
-// A block of samples has its own sums of the parameters' gradients, which are then added in order: no more blocks than
-// kMaxBlocks, nor smaller ones than kLeastBlock. Multiples of a tile.
-constexpr int64_t kLeastBlock = 1920, kMaxBlocks = 64;
-
 template <typename S>
 struct Field {
   using T = Compute<S>;
@@ -41,7 +36,7 @@ struct Field {
   Tensor map, points, parameters;
   std::vector<int64_t> widths;  // encoding, hidden ..., outputs
   std::unique_ptr<S[]> zeros;
-  std::vector<S> packed;
+  std::unique_ptr<char[]> packed;
   std::vector<std::vector<T>> padded;  // biases and the row of the distance
   std::vector<T> grid;                 // [B N, 2], made where wanted
   int64_t batch, num_samples, stride;
@@ -91,7 +86,10 @@ struct Field {
 
   int64_t columns(int64_t layer) const { return field_kernels<S>().columns(widths[layer]); }
 
-  std::vector<int64_t> saved_shape(int64_t layers) const { return {layers, num_samples, stride}; }
+  // Nothing kept has no rows either: torch cannot copy some shapes of no elements.
+  std::vector<int64_t> saved_shape(int64_t layers) const {
+    return layers > 0 ? std::vector<int64_t>{layers, num_samples, stride} : std::vector<int64_t>{0, 0, 0};
+  }
 
   // Positions in the map, as sample_bev takes them.
   void make_grid() {
@@ -124,7 +122,7 @@ struct Field {
       PRED_CHECK(m.size[axis] >= 1, op, ": projected must have at least one cell along each axis, got ",
                  shape_text(map));
     }
-    zeros.reset(new S[m.channels]());
+    zeros = allocate_zeros<S>(m.channels);
     m.zeros = zeros.get();
   }
 
@@ -141,9 +139,8 @@ struct Field {
       from[l] = at;
       at += widths[l + 1] * (widths[l] + 1);
     }
-    const int64_t line = 64 / int64_t(sizeof(S));
-    packed.resize(size + line);
-    S* first = reinterpret_cast<S*>((reinterpret_cast<uintptr_t>(packed.data()) + 63) / 64 * 64);
+    packed = allocate_array<char>(size * int64_t(sizeof(S)) + Arena::kAlignment);
+    S* first = Arena(packed.get()).template take<S>(size);
     const T* data = parameters.const_data_ptr<T>();
     parallel(2 * layers, 1, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) {
@@ -192,12 +189,10 @@ Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor
     const FieldOutputs<S> out{sdf.mutable_data_ptr<T>(), semantics.mutable_data_ptr<T>(),
                               with_gradient ? gradient.mutable_data_ptr<T>() : nullptr};
     const FieldKernels<S>& k = field_kernels<S>();
-    const int64_t bytes = k.scratch_bytes(in.args, false);
-    const int64_t tasks = (in.num_samples + kForwardGrain - 1) / kForwardGrain;
-    parallel(tasks, 1, [&](int64_t first, int64_t last) {
-      const std::unique_ptr<char[]> scratch(new char[bytes]);
-      k.forward(in.args, saved, out, scratch.get(), first * kForwardGrain,
-                std::min(last * kForwardGrain, in.num_samples), in.num_samples);
+    const Blocks tasks = product_tasks(in.num_samples);
+    parallel(tasks.count(), 1, [&](int64_t first, int64_t last) {
+      const auto scratch = allocate_array<char>(k.scratch_bytes(in.args, false));
+      k.forward(in.args, saved, out, scratch.get(), tasks.begin(first), tasks.end(last - 1), in.num_samples);
     });
     return Outputs(sdf, semantics, gradient, activation, slope, chain);
   });
@@ -239,33 +234,30 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
                ": slope must be given with activation, got one of them");
 
     const int64_t width = in.args.map.channels, layers = in.args.num_hidden + 1;
-    const auto rows = [&](bool wanted) {
-      return std::unique_ptr<S[]>(wanted ? new S[in.num_samples * width] : nullptr);
-    };
-    const std::unique_ptr<S[]> along_map = rows(need_projected), along_slope = rows(need_projected && grad.gradient);
-    std::vector<T> directions(need_projected && grad.gradient ? 2 * in.num_samples : 0);
+    const bool along = need_projected && grad.gradient;
+    std::unique_ptr<S[]> along_map, along_slope;
+    if (need_projected) along_map = allocate_array<S>(in.num_samples * width);
+    if (along) along_slope = allocate_array<S>(in.num_samples * width);
+    std::vector<T> directions(along ? 2 * in.num_samples : 0);
     Tensor out_points = torch::stable::new_empty(in.points, {need_points ? frames : 0, count, 3});
     Tensor out_parameters = torch::stable::new_empty(in.parameters, {need_parameters ? parameters.size(0) : 0});
 
     // Each block's sums: dW [outputs, columns] and db of one layer after the other.
     int64_t block_sums = 0;
     for (int64_t l = 0; l < layers; ++l) block_sums += widths[l + 1] * (in.columns(l) + 1);
-    const int64_t wanted_block = (in.num_samples + kMaxBlocks - 1) / kMaxBlocks;
-    const int64_t block = (std::max(wanted_block, kLeastBlock) + kLeastBlock - 1) / kLeastBlock * kLeastBlock;
-    const int64_t num_blocks = (in.num_samples + block - 1) / block;
-    const std::unique_ptr<T[]> sums(need_parameters ? new T[num_blocks * block_sums] : nullptr);
+    const Blocks blocks = product_sums(in.num_samples);
+    std::unique_ptr<T[]> sums;
+    if (need_parameters) sums = allocate_array<T>(blocks.count() * block_sums);
     const FieldKernels<S>& k = field_kernels<S>();
-    const int64_t bytes = k.scratch_bytes(in.args, true);
-    parallel(num_blocks, 1, [&](int64_t first, int64_t last) {
-      const std::unique_ptr<char[]> scratch(new char[bytes]);
-      for (int64_t b = first; b < last; ++b) {
-        T* part = sums ? sums.get() + b * block_sums : nullptr;
+    parallel(blocks.count(), 1, [&](int64_t first, int64_t last) {
+      const auto scratch = allocate_array<char>(k.scratch_bytes(in.args, true));
+      for (int64_t block = first; block < last; ++block) {
+        T* part = sums ? sums.get() + block * block_sums : nullptr;
         if (part) std::fill(part, part + block_sums, T(0));
         const FieldGradients<S> out{part, along_map.get(), along_slope.get(),
                                     directions.empty() ? nullptr : directions.data(),
                                     need_points ? out_points.mutable_data_ptr<T>() : nullptr};
-        k.backward(in.args, saved, grad, out, scratch.get(), b * block, std::min((b + 1) * block, in.num_samples),
-                   in.num_samples);
+        k.backward(in.args, saved, grad, out, scratch.get(), blocks.begin(block), blocks.end(block), in.num_samples);
       }
     });
 
@@ -274,19 +266,12 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
       const T* from = sums.get();
       for (int64_t l = 0; l < layers; ++l) {
         const int64_t outputs = widths[l + 1], inputs = widths[l], columns = in.columns(l);
-        parallel(outputs + 1, 16, [&](int64_t begin, int64_t end) {
-          for (int64_t row = begin; row < end; ++row) {  // the row behind the last one: db
-            T* sum = to + row * inputs;
-            const int64_t elements = row < outputs ? inputs : outputs;
-            std::fill(sum, sum + elements, T(0));
-            for (int64_t b = 0; b < num_blocks; ++b) {
-              const T* part = from + b * block_sums + row * columns;
-              for (int64_t i = 0; i < elements; ++i) sum[i] += part[i];
-            }
-          }
-        });
-        to += outputs * (inputs + 1);
-        from += outputs * (columns + 1);
+        add_blocks(from, blocks.count(), block_sums, outputs, columns, inputs, to);
+        from += outputs * columns;
+        to += outputs * inputs;
+        add_blocks(from, blocks.count(), block_sums, 1, 0, outputs, to);
+        from += outputs;
+        to += outputs;
       }
     }
     Tensor out_map = torch::stable::new_empty(in.map, {0});

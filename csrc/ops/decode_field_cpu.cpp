@@ -3,6 +3,7 @@
 //
 // A tile of samples goes through all layers before the next one, so that its rows stay in cache; bias, Softplus and its
 // derivatives are epilogues of the products. One iteration owns the samples of its range.
+#include "common/allocate.h"
 #include "math/product.h"
 #include "math/softplus.h"
 #include "ops/decode_field.h"
@@ -28,7 +29,7 @@ struct Tile {
   uintptr_t end;
 
   Tile(const FieldArgs<S>& a, bool backward, char* memory) {
-    Arena arena{uintptr_t(memory)};
+    Arena arena(memory);
     width = a.map.channels;
     columns = panel_columns<T>(width);  // of hidden rows that products write
     stride = field_stride(width);
@@ -79,7 +80,7 @@ struct Tile {
 
 template <typename S>
 static int64_t scratch_bytes(const FieldArgs<S>& a, bool backward) {
-  return int64_t(Tile<S>(a, backward, nullptr).end) + 64;
+  return int64_t(Tile<S>(a, backward, nullptr).end) + Arena::kAlignment;
 }
 
 // --- Encoding and map ----------------------------------------------------------------------------

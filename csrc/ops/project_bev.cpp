@@ -8,10 +8,10 @@
 #include <algorithm>
 #include <memory>
 #include <tuple>
-#include <vector>
 
+#include "common/allocate.h"
+#include "common/blocks.h"
 #include "common/check.h"
-#include "common/parallel.h"
 
 namespace pred {
 namespace {
@@ -28,15 +28,12 @@ const ProjectKernels<S>& project_kernels() {
     return PRED_KERNELS(project_bev_bf16);
 }
 
-constexpr int64_t kGrain = 960;                         // cells per task of the forward pass: whole tiles
-constexpr int64_t kLeastBlock = 1920, kMaxBlocks = 64;  // cells that share sums of the weight's gradient
-
 template <typename S>
 struct Projection {
   using T = Compute<S>;
   Tensor bev, weight;
   int64_t cells;
-  std::vector<S> packed;
+  std::unique_ptr<char[]> packed;
   ProjectArgs<S> args{};
 
   Projection(const char* op, const Tensor& bev_in, const Tensor& weight_in, bool backward) {
@@ -52,8 +49,9 @@ struct Projection {
     cells = bev.size(0) * bev.size(2) * bev.size(3);
     const ProjectKernels<S>& k = project_kernels<S>();
     const int64_t rows = backward ? args.outputs : args.inputs, columns = backward ? args.inputs : args.outputs;
-    packed.resize(k.packed_size(rows, columns) + 64 / int64_t(sizeof(S)));
-    S* first = reinterpret_cast<S*>((reinterpret_cast<uintptr_t>(packed.data()) + 63) / 64 * 64);
+    const int64_t size = k.packed_size(rows, columns);
+    packed = allocate_array<char>(size * int64_t(sizeof(S)) + Arena::kAlignment);
+    S* first = Arena(packed.get()).template take<S>(size);
     const T* data = weight.const_data_ptr<T>();
     k.pack(data, backward ? args.inputs : 1, backward ? 1 : args.inputs, rows, columns, first);
     args.packed = first;
@@ -73,9 +71,10 @@ Tensor project_bev(const Tensor& bev, const Tensor& weight) {
     Tensor out = in.new_map(in.args.outputs);
     S* data = mutable_storage<S>(out);
     const ProjectKernels<S>& k = project_kernels<S>();
-    parallel((in.cells + kGrain - 1) / kGrain, 1, [&](int64_t first, int64_t last) {
-      const std::unique_ptr<char[]> scratch(new char[k.scratch_bytes(in.args)]);
-      k.forward(in.args, data, scratch.get(), first * kGrain, std::min(last * kGrain, in.cells));
+    const Blocks tasks = product_tasks(in.cells);
+    parallel(tasks.count(), 1, [&](int64_t first, int64_t last) {
+      const auto scratch = allocate_array<char>(k.scratch_bytes(in.args));
+      k.forward(in.args, data, scratch.get(), tasks.begin(first), tasks.end(last - 1));
     });
     return out;
   });
@@ -95,31 +94,21 @@ std::tuple<Tensor, Tensor> project_bev_backward(const Tensor& grad_in, const Ten
     Tensor out_bev = need_bev ? in.new_map(in.args.inputs) : torch::stable::new_empty(in.bev, {0});
     Tensor out_weight = torch::stable::new_empty(in.weight, {need_weight ? in.args.outputs : 0, in.args.inputs});
     const int64_t columns = k.columns(in.args.inputs), sums_size = in.args.outputs * columns;
-    const int64_t wanted = std::max((in.cells + kMaxBlocks - 1) / kMaxBlocks, kLeastBlock);
-    const int64_t block = (wanted + kLeastBlock - 1) / kLeastBlock * kLeastBlock;
-    const int64_t num_blocks = (in.cells + block - 1) / block;
-    const std::unique_ptr<T[]> sums(need_weight ? new T[num_blocks * sums_size] : nullptr);
-    parallel(num_blocks, 1, [&](int64_t first, int64_t last) {
-      const std::unique_ptr<char[]> scratch(new char[k.scratch_bytes(in.args)]);
-      for (int64_t b = first; b < last; ++b) {
-        T* part = sums ? sums.get() + b * sums_size : nullptr;
+    const Blocks blocks = product_sums(in.cells);
+    std::unique_ptr<T[]> sums;
+    if (need_weight) sums = allocate_array<T>(blocks.count() * sums_size);
+    parallel(blocks.count(), 1, [&](int64_t first, int64_t last) {
+      const auto scratch = allocate_array<char>(k.scratch_bytes(in.args));
+      for (int64_t block = first; block < last; ++block) {
+        T* part = sums ? sums.get() + block * sums_size : nullptr;
         if (part) std::fill(part, part + sums_size, T(0));
-        k.backward(in.args, {need_bev ? mutable_storage<S>(out_bev) : nullptr, part}, scratch.get(), b * block,
-                   std::min((b + 1) * block, in.cells));
+        k.backward(in.args, {need_bev ? mutable_storage<S>(out_bev) : nullptr, part}, scratch.get(),
+                   blocks.begin(block), blocks.end(block));
       }
     });
     if (need_weight) {
-      T* to = out_weight.mutable_data_ptr<T>();
-      parallel(in.args.outputs, 16, [&](int64_t begin, int64_t end) {
-        for (int64_t row = begin; row < end; ++row) {
-          T* sum = to + row * in.args.inputs;
-          std::fill(sum, sum + in.args.inputs, T(0));
-          for (int64_t b = 0; b < num_blocks; ++b) {
-            const T* part = sums.get() + b * sums_size + row * columns;
-            for (int64_t i = 0; i < in.args.inputs; ++i) sum[i] += part[i];
-          }
-        }
-      });
+      add_blocks(sums.get(), blocks.count(), sums_size, in.args.outputs, columns, in.args.inputs,
+                 out_weight.mutable_data_ptr<T>());
     }
     return std::make_tuple(out_bev, out_weight);
   });

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // One iteration owns the cells of its range.
+#include "common/allocate.h"
 #include "math/product.h"
 #include "ops/project_bev.h"
 
@@ -19,7 +20,7 @@ struct Tile {
   uintptr_t end;
 
   Tile(const ProjectArgs<S>& a, char* memory) {
-    Arena arena{uintptr_t(memory)};
+    Arena arena(memory);
     in_stride = panel_columns<T>(a.inputs);
     out_stride = panel_columns<T>(a.outputs);
     in = arena.take<S>(kTile * in_stride);
@@ -32,7 +33,7 @@ struct Tile {
 
 template <typename S>
 static int64_t scratch_bytes(const ProjectArgs<S>& a) {
-  return int64_t(Tile<S>(a, nullptr).end) + 64;
+  return int64_t(Tile<S>(a, nullptr).end) + Arena::kAlignment;
 }
 
 // Returns whether any number is not 0.

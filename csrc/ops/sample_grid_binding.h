@@ -65,9 +65,7 @@ struct SampleGrid {
       }
       args.border = border;
       args.align_corners = align_corners;
-      const int64_t num_zeros = num_samples() > 0 ? args.channels : 0;
-      zeros = allocate_array<S>(num_zeros);
-      std::fill_n(zeros.get(), num_zeros, S());
+      zeros = allocate_zeros<S>(num_samples() > 0 ? args.channels : 0);
       args.zeros = zeros.get();
     }
 

@@ -423,14 +423,17 @@ def _fake(
     frames, count = points.shape[:2]
     hidden = len(widths) - 2
     stride = (widths[1] + 31) // 32 * 32
-    rows = frames * count
+
+    def kept(layers: int) -> Tensor:
+        return projected.new_empty((layers, frames * count, stride) if keep and layers > 0 else (0, 0, 0))
+
     return (
         points.new_empty(frames, count),
         points.new_empty(frames, count, widths[-1] - 1),
         points.new_empty(frames, count if with_gradient else 0, 3),
-        projected.new_empty(hidden if keep else 0, rows, stride),
-        projected.new_empty(hidden if keep else 0, rows, stride),
-        projected.new_empty(hidden - 1 if keep and with_gradient else 0, rows, stride),
+        kept(hidden),
+        kept(hidden),
+        kept(hidden - 1 if with_gradient else 0),
     )
 
 

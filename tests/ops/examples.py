@@ -43,6 +43,10 @@ class Source:
         """Any other size, in [low, high]."""
         return default
 
+    def tensors(self, default: int, low: int, high: int) -> int:
+        """How many tensors a list argument has."""
+        return self.size(default, low, high)
+
     def normal(self, *shape: int) -> Tensor:
         return torch.randn(shape, generator=self._generator, dtype=torch.float64)
 
@@ -254,7 +258,7 @@ def _decode_field(source: Source) -> Arguments:
     """Elements of ``weights`` and ``biases`` by their own names, see ``by_element``. Points are off the lines through
     cell centres, where the derivative jumps."""
     frames, channels, classes = source.size(2, 0, 3), source.size(5, 1, 40), source.size(4, 0, 20)
-    hidden, layers, frequencies = source.size(20, 1, 70), source.size(3, 2, 5), source.size(2, 0, 4)
+    hidden, layers, frequencies = source.size(20, 1, 70), source.tensors(3, 2, 5), source.size(2, 0, 4)
     widths = [channels + 3 + 6 * frequencies, *[hidden] * (layers - 1), 1 + classes]
     arguments: Arguments = {
         "bev": source.normal(frames, channels, 8, 16),

@@ -106,6 +106,9 @@ class VariedSource(Source):
     def size(self, default: int, low: int, high: int) -> int:
         return min(default + self.count % 5, high)
 
+    def tensors(self, default: int, low: int, high: int) -> int:
+        return default  # a graph has a fixed number of inputs
+
 
 REFERENCE_GRAPHS = {example.op: example for example in reversed(EXAMPLES) if example.reference_compiles}
 """One example per op: that plain PyTorch compiles is not in question everywhere."""
