@@ -49,16 +49,14 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "project_bev_backward(Tensor grad, Tensor bev, Tensor weight, bool need_bev, bool need_weight) -> "
       "(Tensor, Tensor)");
   m.def(
-      "decode_field(Tensor projected, Tensor points, Tensor parameters, SymInt[] widths, float[] point_range, int "
-      "octaves, "
-      "float beta, float sdf_scale, bool with_gradient, bool keep) -> "
+      "decode_field(Tensor projected, Tensor points, Tensor parameters, SymInt[] widths, float[] point_range, "
+      "SymInt octaves, float beta, float sdf_scale, bool with_gradient, bool keep) -> "
       "(Tensor sdf, Tensor semantics, Tensor gradient, Tensor activation, Tensor slope, Tensor chain)");
   m.def(
       "decode_field_backward(Tensor? grad_sdf, Tensor? grad_semantics, Tensor? grad_gradient, Tensor projected, "
       "Tensor points, Tensor parameters, Tensor activation, Tensor slope, Tensor chain, SymInt[] widths, "
-      "float[] point_range, "
-      "int octaves, float beta, float sdf_scale, bool need_projected, bool need_points, bool need_parameters) -> "
-      "(Tensor, Tensor, Tensor)");
+      "float[] point_range, SymInt octaves, float beta, float sdf_scale, bool need_projected, bool need_points, "
+      "bool need_parameters) -> (Tensor, Tensor, Tensor)");
 
   m.def("segment_reduce(Tensor features, Tensor index, SymInt num_segments, str reduce) -> (Tensor, Tensor)");
   m.def("segment_reduce_backward(Tensor grad, Tensor index, Tensor saved, str reduce) -> Tensor");
