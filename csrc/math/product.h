@@ -101,6 +101,20 @@ static inline __attribute__((always_inline)) auto load_packed(const S* from) {
   return v;
 }
 
+// As store_values, for rows that products read. Where there is a dot-product instruction, which takes subnormal bfloat16
+// for 0, they are stored as 0.
+template <int N, typename S>
+static inline __attribute__((always_inline)) void store_factors(S* to, Vec<Compute<S>, N> values) {
+#if defined(__AVX512BF16__)
+  if constexpr (std::is_same_v<S, BFloat16> && N == 16) {
+    const __m256bh rounded = _mm512_cvtneps_pbh(values);
+    __builtin_memcpy(to, &rounded, sizeof rounded);
+    return;
+  }
+#endif
+  store_values<N>(to, values);
+}
+
 template <int kRows, typename S, class Epilogue>
 static inline void product_tile(const S* a, int64_t a_stride, int64_t k, const S* b, int64_t row, int64_t column,
                                 const Epilogue& epilogue) {
@@ -143,25 +157,23 @@ static inline void product(const S* a, int64_t a_stride, int64_t rows, int64_t k
   }
 }
 
-// Rows as outer_product wants them: bfloat16 as [(count + 1) / 2][stride][2], with zeros where a row is missing.
+// Rows of whole panels as outer_product wants them: bfloat16 as [(count + 1) / 2][stride][2], with zeros where a row is
+// missing.
 template <typename S>
 static const S* interleave(const S* rows, int64_t stride, int64_t count, S* buffer) {
   if constexpr (kPair<S> == 1) {
     return rows;
   } else {
+    constexpr int W = kWidth<float>;
     for (int64_t r = 0; r < count; r += 2) {
-      const S *first = rows + r * stride, *second = first + stride;
-      S* to = buffer + r * stride;
-      if (r + 1 < count) {
-        for (int64_t c = 0; c < stride; ++c) {
-          to[2 * c] = first[c];
-          to[2 * c + 1] = second[c];
-        }
-      } else {
-        for (int64_t c = 0; c < stride; ++c) {
-          to[2 * c] = first[c];
-          to[2 * c + 1] = S{0};
-        }
+      const S* first = rows + r * stride;
+      for (int64_t c = 0; c < stride; c += W) {
+        Vec<uint16_t, W> low, high{};
+        __builtin_memcpy(&low, first + c, sizeof low);
+        if (r + 1 < count) __builtin_memcpy(&high, first + stride + c, sizeof high);
+        using Both = Vec<uint32_t, W>;
+        const Both both = __builtin_convertvector(low, Both) | __builtin_convertvector(high, Both) << 16;
+        __builtin_memcpy(buffer + r * stride + 2 * c, &both, sizeof both);
       }
     }
     return buffer;

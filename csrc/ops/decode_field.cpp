@@ -180,9 +180,12 @@ Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor
     Tensor semantics = torch::stable::new_empty(in.points, {frames, count, classes});
     Tensor gradient = torch::stable::new_empty(in.points, {frames, with_gradient ? count : 0, 3});
     const int64_t layers = in.args.num_hidden;
-    Tensor activation = torch::stable::new_empty(in.map, in.saved_shape(keep ? layers : 0));
-    Tensor chain = torch::stable::new_empty(in.map, in.saved_shape(keep && with_gradient ? layers - 1 : 0));
-    Tensor slope = torch::stable::new_empty(in.map, in.saved_shape(keep ? layers : 0));
+    const auto kept = [&](int64_t rows) {
+      Tensor tensor = torch::stable::new_empty(in.map, in.saved_shape(keep ? rows : 0));
+      prefer_large_pages(tensor.mutable_data_ptr(), tensor.numel() * int64_t(sizeof(S)));
+      return tensor;
+    };
+    Tensor activation = kept(layers), slope = kept(layers), chain = kept(with_gradient ? layers - 1 : 0);
     const FieldSaved<S> saved{keep ? mutable_storage<S>(activation) : nullptr,
                               keep ? mutable_storage<S>(slope) : nullptr,
                               keep && with_gradient ? mutable_storage<S>(chain) : nullptr};

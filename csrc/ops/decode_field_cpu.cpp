@@ -190,8 +190,8 @@ static void activations(const FieldArgs<S>& a, const Tile<S>& tile, int64_t coun
       const int64_t at = row * stride + column;
       const Vec<T, W> z = sum + load<W>(bias + column);
       const auto a = softplus(beta, gathered ? z + load_values<W>(gathered + at) : z);
-      store_values<W>(out + at, a.value);
-      store_values<W>(slope + at, a.slope);
+      store_factors<W>(out + at, a.value);
+      store_factors<W>(slope + at, a.slope);
     };
     if (l == 0) {
       product(tile.encoding, tile.encoding_stride, count, tile.encoding_width, a.up[0], tile.width, epilogue);
@@ -210,7 +210,7 @@ static void last_of_chain(const FieldArgs<S>& a, const Tile<S>& tile, int64_t co
   for (int64_t r = 0; r < count; ++r) {
     for (int64_t c = 0; c < tile.columns; c += W) {
       const int64_t at = r * tile.stride + c;
-      store_values<W>(out + at, load_values<W>(slope + at) * load<W>(a.sdf_row + c));
+      store_factors<W>(out + at, load_values<W>(slope + at) * load<W>(a.sdf_row + c));
     }
   }
 }
@@ -226,7 +226,7 @@ static void chain(const FieldArgs<S>& a, const Tile<S>& tile, int64_t count) {
     product(tile.chain[l], stride, count, tile.width, a.down[l], tile.width,
             [=](int64_t row, int64_t column, Vec<T, W> sum) __attribute__((always_inline)) {
               const int64_t at = row * stride + column;
-              store_values<W>(out + at, sum * load_values<W>(slope + at));
+              store_factors<W>(out + at, sum * load_values<W>(slope + at));
             });
   }
 }
@@ -303,8 +303,8 @@ static void tangents(const FieldArgs<S>& a, const Tile<S>& tile, int64_t begin, 
       const int64_t at = row * stride + column;
       const Vec<T, W> y = gathered ? sum + load_values<W>(gathered + at) : sum;
       const Vec<T, W> s = load_values<W>(slope + at);
-      store_values<W>(rate + at, s * y);
-      store_values<W>(back + at, load_values<W>(chain + at) * y * (beta_value - beta_value * s));
+      store_factors<W>(rate + at, s * y);
+      store_factors<W>(back + at, load_values<W>(chain + at) * y * (beta_value - beta_value * s));
     };
     if (l == 0) {
       product(tile.encoding_rate, tile.encoding_stride, count, tile.encoding_width, a.up[0], tile.width, epilogue);
@@ -325,7 +325,7 @@ static void reverse(const FieldArgs<S>& a, const Tile<S>& tile, int64_t count, b
     const auto epilogue = [=](int64_t row, int64_t column, Vec<T, W> sum) __attribute__((always_inline)) {
       const int64_t at = row * stride + column;
       const Vec<T, W> x = sum * load_values<W>(slope + at);
-      store_values<W>(back + at, has_tangents ? x + load_values<W>(back + at) : x);
+      store_factors<W>(back + at, has_tangents ? x + load_values<W>(back + at) : x);
     };
     if (l == tile.layers) {
       product(tile.output, tile.output_stride, count, a.num_outputs, a.down[l], tile.width, epilogue);

@@ -63,7 +63,7 @@ static void multiply(const S* rows, int64_t row_stride, int64_t count, int64_t i
   constexpr int W = kWidth<T>;
   product(rows, row_stride, count, inputs, packed, outputs,
           [=](int64_t row, int64_t column, Vec<T, W> sum)
-              __attribute__((always_inline)) { store_values<W>(out + row * stride + column, sum); });
+              __attribute__((always_inline)) { store_factors<W>(out + row * stride + column, sum); });
 }
 
 template <typename S>
