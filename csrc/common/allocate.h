@@ -45,8 +45,8 @@ std::unique_ptr<T[]> allocate_zeros(int64_t count) {
   return memory;
 }
 
-// Gives out pieces of a block of memory, which has to have kAlignment bytes more than they; from null, only `at` is of
-// use, their total size.
+// Gives out pieces of a block of memory, which has to have kAlignment bytes more for each and for itself; from null,
+// only `at` is of use, their total size.
 struct Arena {
   static constexpr int64_t kAlignment = 64;
   uintptr_t at;

@@ -126,35 +126,59 @@ struct Field {
     m.zeros = zeros.get();
   }
 
+  // [W_1, W_1, W_1 - rounded W_1], transposed.
+  std::vector<T> split_first(const T* weight) const {
+    const int64_t in = widths[0], out = widths[1];
+    std::vector<T> parts(kFieldParts<S> * in * out);
+    for (int64_t i = 0; i < in; ++i) {
+      for (int64_t o = 0; o < out; ++o) {
+        const T whole = weight[o * in + i];
+        S rounded;
+        narrow_to(rounded, whole);
+        parts[i * out + o] = parts[(in + i) * out + o] = whole;
+        parts[(2 * in + i) * out + o] = whole - widen(rounded);
+      }
+    }
+    return parts;
+  }
+
   void pack_parameters() {
     const FieldKernels<S>& k = field_kernels<S>();
-    const int64_t layers = args.num_hidden + 1;
-    std::vector<int64_t> up(layers), down(layers), from(layers);
-    int64_t size = 0, at = 0;
+    const int64_t layers = args.num_hidden + 1, parts = kFieldParts<S> * widths[0];
+    int64_t size = kFieldParts<S> > 1 ? k.packed_size(parts, widths[1]) : 0;
     for (int64_t l = 0; l < layers; ++l) {
-      up[l] = size;
-      size += k.packed_size(widths[l], widths[l + 1]);
-      down[l] = size;
-      size += k.packed_size(widths[l + 1], widths[l]);
+      size += k.packed_size(widths[l], widths[l + 1]) + k.packed_size(widths[l + 1], widths[l]);
+    }
+    packed = allocate_array<char>(size * int64_t(sizeof(S)) + (2 * layers + 2) * Arena::kAlignment);
+    Arena arena(packed.get());
+    const T* data = parameters.const_data_ptr<T>();
+    std::vector<S*> up(layers), down(layers);
+    std::vector<int64_t> from(layers);
+    for (int64_t l = 0, at = 0; l < layers; ++l) {
+      up[l] = arena.template take<S>(k.packed_size(widths[l], widths[l + 1]));
+      down[l] = arena.template take<S>(k.packed_size(widths[l + 1], widths[l]));
       from[l] = at;
       at += widths[l + 1] * (widths[l] + 1);
     }
-    packed = allocate_array<char>(size * int64_t(sizeof(S)) + Arena::kAlignment);
-    S* first = Arena(packed.get()).template take<S>(size);
-    const T* data = parameters.const_data_ptr<T>();
+    args.first = up[0];
+    if constexpr (kFieldParts<S> > 1) {
+      S* first = arena.template take<S>(k.packed_size(parts, widths[1]));
+      k.pack(split_first(data).data(), widths[1], 1, parts, widths[1], first);
+      args.first = first;
+    }
     parallel(2 * layers, 1, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) {
         const int64_t l = i / 2, in = widths[l], out = widths[l + 1];
         if (i % 2 == 0)
-          k.pack(data + from[l], 1, in, in, out, first + up[l]);
+          k.pack(data + from[l], 1, in, in, out, up[l]);
         else
-          k.pack(data + from[l], in, 1, out, in, first + down[l]);
+          k.pack(data + from[l], in, 1, out, in, down[l]);
       }
     });
     padded.resize(layers + 1);
     for (int64_t l = 0; l < layers; ++l) {
-      args.up[l] = first + up[l];
-      args.down[l] = first + down[l];
+      args.up[l] = up[l];
+      args.down[l] = down[l];
       const T* bias = data + from[l] + widths[l + 1] * widths[l];
       padded[l].assign(std::max(stride, columns(l + 1)), T(0));
       std::copy(bias, bias + widths[l + 1], padded[l].begin());

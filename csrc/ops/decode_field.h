@@ -17,8 +17,12 @@
 //   dW_1 = x_1 e^T + g_1 (J v)^T,   dW_o = o a_L^T, and in row 0 sdf_scale (s_L * y_L)^T,   db_o = o
 //   the map gets x_1 along F and g_1 along F' v;  dn = J^T W_1^T x_1 + F'^T x_1 + (d/dn of y_1)^T g_1
 //
-// Rows of hidden width are stored as S; T = Compute<S>.
+// Rows of hidden width are stored as S; T = Compute<S>. Half precision rounds W_1 e less than the rest: it has the high
+// frequencies, and its share of z is one of the largest. Both factors are split into a rounded part and what is left of
+// it, whose products with the other rounded part are added.
 #pragma once
+
+#include <type_traits>
 
 #include "common/isa.h"
 #include "ops/sample_grid.h"
@@ -30,6 +34,11 @@ constexpr int kMaxHidden = 15;
 // Elements from one row of hidden width to the next, the same at every level: whole panels of math/product.h.
 PRED_HOST_DEVICE int64_t field_stride(int64_t width) { return (width + 31) / 32 * 32; }
 
+// Rows of the first matrix, and columns of the encoding's rows: W_1 e, or [W_1, W_1, W_1 - rounded W_1] [e, e - rounded
+// e, e].
+template <typename S>
+constexpr int64_t kFieldParts = std::is_same_v<S, Compute<S>> ? 1 : 3;
+
 template <typename S>
 struct FieldArgs {
   using T = Compute<S>;
@@ -40,6 +49,7 @@ struct FieldArgs {
   T beta, sdf_scale;
   int64_t num_hidden, num_outputs;  // outputs: 1, or 1 + K
   // Packed: up[l] is W_l^T, [inputs, width]; down[l] is W_l, [width, inputs]. Index num_hidden is the output layer.
+  const S* first;  // up[0] in kFieldParts<S> parts
   const S* up[kMaxHidden + 1];
   const S* down[kMaxHidden + 1];
   const T* bias[kMaxHidden + 1];

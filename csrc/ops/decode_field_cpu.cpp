@@ -17,7 +17,8 @@ constexpr int64_t kTile = 96;  // samples
 template <typename S>
 struct Tile {
   using T = Compute<S>;
-  int64_t width, columns, stride, encoding_width, encoding_stride, output_stride, few_stride, angles, layers;
+  int64_t width, columns, stride, encoding_width, encoding_columns, encoding_stride, rate_stride, output_stride,
+      few_stride, angles, layers;
   S *encoding, *encoding_rate, *gathered, *output;
   S *activation[kMaxHidden], *slope[kMaxHidden], *chain[kMaxHidden], *rate[kMaxHidden], *back[kMaxHidden];
   S* interleaved[2];
@@ -35,9 +36,11 @@ struct Tile {
     stride = field_stride(width);
     angles = 3 * a.octaves;
     encoding_width = 3 + 2 * angles;
-    encoding_stride = panel_columns<T>(encoding_width);
+    encoding_columns = kFieldParts<S> * encoding_width;
+    encoding_stride = panel_columns<T>(encoding_columns);
+    rate_stride = panel_columns<T>(encoding_width);
     output_stride = panel_columns<T>(a.num_outputs);
-    few_stride = encoding_stride > output_stride ? encoding_stride : output_stride;
+    few_stride = rate_stride > output_stride ? rate_stride : output_stride;
     layers = a.num_hidden;
     beta = softplus_scale(a.beta);
     beta_value = a.beta;
@@ -58,11 +61,12 @@ struct Tile {
         rate[l] = arena.take<S>(rows);
         back[l] = arena.take<S>(rows);
       }
-      encoding_rate = arena.take<S>(kTile * encoding_stride);
+      encoding_rate = arena.take<S>(kTile * rate_stride);
       output = arena.take<S>(kTile * output_stride);
       few_chain = arena.take<T>(kTile * few_stride);
       direction = arena.take<T>(kTile * 3);
-      const int64_t widest = few_stride > stride ? few_stride : stride;
+      const int64_t wide = few_stride > stride ? few_stride : stride;
+      const int64_t widest = encoding_stride > wide ? encoding_stride : wide;
       for (S*& buffer : interleaved) buffer = arena.take<S>(kPair<S> > 1 ? kTile * widest : 0);
     }
     end = arena.at;
@@ -84,6 +88,16 @@ static int64_t scratch_bytes(const FieldArgs<S>& a, bool backward) {
 }
 
 // --- Encoding and map ----------------------------------------------------------------------------
+// Part of an encoding's row, in all of its parts.
+template <typename S, typename T = Compute<S>>
+static inline void put(S* __restrict row, int64_t encoding_width, int64_t count, const T* __restrict values) {
+  for (int64_t i = 0; i < count; ++i) narrow_to(row[i], values[i]);
+  if constexpr (kFieldParts<S> == 3) {
+    for (int64_t i = 0; i < count; ++i) narrow_to(row[encoding_width + i], values[i] - widen(row[i]));
+    for (int64_t i = 0; i < count; ++i) row[2 * encoding_width + i] = row[i];
+  }
+}
+
 template <typename S, typename T = Compute<S>>
 static void encode(const FieldArgs<S>& a, const Tile<S>& tile, int64_t begin, int64_t count) {
   const int64_t octaves = a.octaves, angles = tile.angles;
@@ -104,10 +118,10 @@ static void encode(const FieldArgs<S>& a, const Tile<S>& tile, int64_t begin, in
       cosine[i] = T(both.cosine);
     }
     S* __restrict row = tile.encoding + r * tile.encoding_stride;
-    for (int axis = 0; axis < 3; ++axis) narrow_to(row[axis], position[axis]);
-    for (int64_t i = 0; i < angles; ++i) narrow_to(row[3 + i], sine[i]);
-    for (int64_t i = 0; i < angles; ++i) narrow_to(row[3 + angles + i], cosine[i]);
-    for (int64_t i = tile.encoding_width; i < tile.encoding_stride; ++i) narrow_to(row[i], T(0));
+    put(row, tile.encoding_width, 3, position);
+    put(row + 3, tile.encoding_width, angles, sine);
+    put(row + 3 + angles, tile.encoding_width, angles, cosine);
+    for (int64_t i = tile.encoding_columns; i < tile.encoding_stride; ++i) narrow_to(row[i], T(0));
   }
 }
 
@@ -116,7 +130,7 @@ template <typename S, typename T = Compute<S>>
 static void encode_rate(const FieldArgs<S>& a, const Tile<S>& tile, int64_t count) {
   for (int64_t r = 0; r < count; ++r) {
     const T *v = tile.direction + 3 * r, *sine = tile.sine + r * tile.angles, *cosine = tile.cosine + r * tile.angles;
-    S* row = tile.encoding_rate + r * tile.encoding_stride;
+    S* row = tile.encoding_rate + r * tile.rate_stride;
     for (int axis = 0; axis < 3; ++axis) narrow_to(row[axis], v[axis]);
     T frequency = 1;
     for (int64_t k = 0, i = 0; k < a.octaves; ++k, frequency *= T(2)) {
@@ -125,7 +139,7 @@ static void encode_rate(const FieldArgs<S>& a, const Tile<S>& tile, int64_t coun
         narrow_to(row[3 + tile.angles + i], -(v[axis] * frequency * sine[i]));
       }
     }
-    for (int64_t i = tile.encoding_width; i < tile.encoding_stride; ++i) narrow_to(row[i], T(0));
+    for (int64_t i = tile.encoding_width; i < tile.rate_stride; ++i) narrow_to(row[i], T(0));
   }
 }
 
@@ -194,7 +208,7 @@ static void activations(const FieldArgs<S>& a, const Tile<S>& tile, int64_t coun
       store_factors<W>(slope + at, a.slope);
     };
     if (l == 0) {
-      product(tile.encoding, tile.encoding_stride, count, tile.encoding_width, a.up[0], tile.width, epilogue);
+      product(tile.encoding, tile.encoding_stride, count, tile.encoding_columns, a.first, tile.width, epilogue);
     } else {
       product(tile.activation[l - 1], stride, count, tile.width, a.up[l], tile.width, epilogue);
     }
@@ -307,7 +321,7 @@ static void tangents(const FieldArgs<S>& a, const Tile<S>& tile, int64_t begin, 
       store_factors<W>(back + at, load_values<W>(chain + at) * y * (beta_value - beta_value * s));
     };
     if (l == 0) {
-      product(tile.encoding_rate, tile.encoding_stride, count, tile.encoding_width, a.up[0], tile.width, epilogue);
+      product(tile.encoding_rate, tile.rate_stride, count, tile.encoding_width, a.up[0], tile.width, epilogue);
     } else {
       product(tile.rate[l - 1], stride, count, tile.width, a.up[l], tile.width, epilogue);
     }
@@ -354,13 +368,12 @@ template <typename S, typename T = Compute<S>>
 static void add_parameters(const FieldArgs<S>& a, const Tile<S>& tile, int64_t count, bool has_tangents, T* sum) {
   const int64_t width = tile.width, stride = tile.stride, last = tile.layers;
   for (int64_t l = 0; l < last; ++l) {
-    const int64_t columns = l == 0 ? tile.encoding_stride : tile.columns;
-    const int64_t row = l == 0 ? tile.encoding_stride : stride;
-    add_outer(tile, tile.back[l], stride, width, l == 0 ? tile.encoding : tile.activation[l - 1], row, columns, count,
-              sum);
+    const int64_t columns = l == 0 ? tile.rate_stride : tile.columns;
+    const S* input = l == 0 ? tile.encoding : tile.activation[l - 1];
+    add_outer(tile, tile.back[l], stride, width, input, l == 0 ? tile.encoding_stride : stride, columns, count, sum);
     if (has_tangents) {
-      add_outer(tile, tile.chain[l], stride, width, l == 0 ? tile.encoding_rate : tile.rate[l - 1], row, columns, count,
-                sum);
+      const S* rate = l == 0 ? tile.encoding_rate : tile.rate[l - 1];
+      add_outer(tile, tile.chain[l], stride, width, rate, l == 0 ? tile.rate_stride : stride, columns, count, sum);
     }
     sum += width * columns;
     add_rows(tile.back[l], stride, width, count, T(1), sum);

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from pred.models.field import FieldConfig, FieldDecoder
 from pred.ops import decode_field, reference
 from pred.ops.decode_field import DecodedField, project_bev
 from tests.conftest import KERNEL_ERROR
@@ -160,6 +161,21 @@ def test_precisions(sizes: dict[str, int], level: str) -> None:
     assert_all_close(results(case, with_gradient=True), expected, 1e-11)
     single = case.to(torch.float32)
     assert_all_close(results(single, with_gradient=True), expected, FP32)
+    # Every hidden layer rounds its inputs, and beta = 10 multiplies what that changes in its slopes.
+    deep = sizes["layers"] > 4
+    assert_all_close(results(single, with_gradient=True, precision="bf16"), expected, 2.5e-2 if deep else BF16)
+
+
+def test_precisions_of_an_untrained_decoder(level: str) -> None:
+    """Its first layer has large high frequencies, unlike `make`."""
+    torch.manual_seed(0)
+    decoder = FieldDecoder(64, FieldConfig(), RANGE)
+    random = make(frequencies=6, channels=64)
+    parameters = [[getattr(layer, kind).detach() for layer in decoder.layers] for kind in ("weight", "bias")]
+    single = Case(random.bev.relu(), random.points, *parameters, random.settings).to(torch.float32)
+    expected = results(single.to(torch.float64), reference.decode_field, with_gradient=True)
+    assert_all_close(results(single, with_gradient=True), expected, FP32)
+    assert_all_close(results(single, with_gradient=True, precision="bf16"), expected, BF16)
 
 
 @pytest.mark.parametrize("size", [1, 95, 96, 97, 1000, 5000])
@@ -224,6 +240,7 @@ def test_saturated_softplus(scale: float, level: str) -> None:
         assert value.isfinite().all(), name
     if scale > 0:
         assert_all_close(actual, expected, FP32)
+        assert_all_close(results(case.to(torch.float32), with_gradient=True, precision="bf16"), expected, BF16)
     else:
         assert_close(actual["sdf"].double(), expected["sdf"], FP32)
         assert float(expected["gradient"].abs().max()) < 1e-40 and (actual["gradient"] == 0).all()
