@@ -394,11 +394,11 @@ class Fuzzer:
         if name == "parallel_probe":
             return "result"
         found = {} if result is None else outputs(result)
+        plain = [
+            _as_number(value, argument) for value, argument in zip(values, op.default._schema.arguments, strict=True)
+        ]
         with FakeTensorMode(shape_env=ShapeEnv(), allow_non_fake_inputs=True) as mode:
-            fake = [
-                mode.from_tensor(value, static_shapes=True) if type(value) is Tensor else value
-                for value in map(_as_number, values, op.default._schema.arguments)
-            ]
+            fake = [mode.from_tensor(value, static_shapes=True) if type(value) is Tensor else value for value in plain]
             expected, fake_error = attempt(lambda: outputs(op(*fake)))
         if fake_error is not None and "pred::" not in str(fake_error):  # a tensor that stands for a number
             raise FindingError(f"the kernel accepts what its fake refuses: {fake_error!r}")
