@@ -394,8 +394,11 @@ class Fuzzer:
         if name == "parallel_probe":
             return "result"
         found = {} if result is None else outputs(result)
+        plain = [
+            _as_number(value, argument) for value, argument in zip(values, op.default._schema.arguments, strict=False)
+        ]
         with FakeTensorMode(shape_env=ShapeEnv(), allow_non_fake_inputs=True) as mode:
-            fake = [mode.from_tensor(value, static_shapes=True) if type(value) is Tensor else value for value in values]
+            fake = [mode.from_tensor(value, static_shapes=True) if type(value) is Tensor else value for value in plain]
             expected, fake_error = attempt(lambda: outputs(op(*fake)))
         if fake_error is not None and "pred::" not in str(fake_error):  # a tensor that stands for a number
             raise FindingError(f"the kernel accepts what its fake refuses: {fake_error!r}")
@@ -406,6 +409,11 @@ class Fuzzer:
             if not fits or any(isinstance(want, int) and have != want for have, want in sizes):
                 raise FindingError(f"{key} is {describe(value)}, its fake says {wanted.dtype}{list(wanted.shape)}")
         return "result"
+
+
+def _as_number(value: Any, argument: torch.Argument) -> Any:
+    """The number that torch reads from a tensor in a number's place; a fake tensor has none."""
+    return value.item() if isinstance(value, Tensor) and "Tensor" not in str(argument.type) else value
 
 
 # --- child and parent ------------------------------------------------------------------------------

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -124,9 +124,11 @@ def check_voxelize_arguments(
 
 
 def _floats(op: str, name: str, values: Sequence[float], count: int) -> list[float]:
-    if not isinstance(values, Iterable):
-        raise TypeError(f"{op}: {name} must hold {count} numbers, got {type(values).__name__}")
-    for value in (values := list(values)):
+    try:
+        values = list(values)
+    except TypeError:  # a tensor or array of no dimensions too, which is an Iterable all the same
+        raise TypeError(f"{op}: {name} must hold {count} numbers, got {type(values).__name__}") from None
+    for value in values:
         check_number(op, name, value)
     floats = [float(value) for value in values]
     if len(floats) != count or not all(math.isfinite(value) for value in floats):

@@ -215,6 +215,8 @@ def test_errors(backend: str) -> None:
             voxelize(points, torch.tensor(wrong, dtype=torch.int64), SIZES[0], RANGE)
     with pytest.raises(ValueError, match=r"batch_offsets must ascend from 0 to N=10, got \[0, 7, 5, 10\]"):
         voxelize(points, torch.tensor([0, 7, 5, 10]), SIZES[0], RANGE)
+    with pytest.raises(TypeError, match="voxelize: voxel_size must hold 3 numbers, got Tensor"):
+        voxelize(points, offsets, torch.tensor(0.3), RANGE)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="voxelize: voxel_size must hold 3 finite numbers, got"):
         voxelize(points, offsets, (0.1, 0.1), RANGE)
     with pytest.raises(ValueError, match="voxelize: point_range must hold 6 finite numbers, got"):
