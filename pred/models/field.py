@@ -124,8 +124,8 @@ class FieldDecoder(nn.Module):
         semantics: bool = True,
     ) -> DecodedField:
         """As `forward`, from a map that `project` returned."""
-        weights = [layer.weight for layer in self._linear_layers()]
-        biases = [layer.bias for layer in self._linear_layers()]
+        weights: list[Tensor] = [layer.weight for layer in self._linear_layers()]
+        biases: list[Tensor] = [layer.bias for layer in self._linear_layers()]
         if not semantics:
             weights[-1], biases[-1] = weights[-1][:1], biases[-1][:1]
         return decode_field(

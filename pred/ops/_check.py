@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -82,6 +83,20 @@ def check_number(op: str, name: str, value: object) -> None:
         raise TypeError(f"{op}: {name} must be a number, got {type(value).__name__}") from None
     except OverflowError:
         raise ValueError(f"{op}: {name} must be in the range of float64, got a larger whole number") from None
+
+
+def check_floats(op: str, name: str, values: Sequence[float], count: int) -> list[float]:
+    """``count`` finite numbers."""
+    try:
+        values = list(values)
+    except TypeError:  # a tensor or array of no dimensions too, which is an Iterable all the same
+        raise TypeError(f"{op}: {name} must hold {count} numbers, got {type(values).__name__}") from None
+    for value in values:
+        check_number(op, name, value)
+    floats = [float(value) for value in values]
+    if len(floats) != count or not all(math.isfinite(value) for value in floats):
+        raise ValueError(f"{op}: {name} must hold {count} finite numbers, got {floats}")
+    return floats
 
 
 def check_count(op: str, name: str, value: int, least: int = 0) -> None:

@@ -23,6 +23,7 @@ from pred.ops._check import (
     check_dtype,
     check_features,
     check_flags,
+    check_floats,
     check_like,
     check_number,
     check_shape,
@@ -266,10 +267,10 @@ def _arguments(
         check_number(OP, name, value)
         if not 0 < value < math.inf:
             raise ValueError(f"{OP}: {name} must be positive and finite, got {value}")
-    box = tuple(float(bound) for bound in point_range)
-    if len(box) != 6 or not all(-math.inf < low < high < math.inf for low, high in zip(box, box[3:], strict=False)):
+    box = check_floats(OP, "point_range", point_range, 6)
+    if not all(low < high for low, high in zip(box, box[3:], strict=False)):
         raise ValueError(f"{OP}: point_range must be x, y, z of the lower, then of the upper corner, got {box}")
-    return points, weights, biases, _Settings(box, frequencies, float(softplus_beta), float(sdf_scale))
+    return points, weights, biases, _Settings(tuple(box), frequencies, float(softplus_beta), float(sdf_scale))
 
 
 def _check_precision(op: str, precision: str, name: str, tensor: Tensor) -> None:

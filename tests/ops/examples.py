@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from benchmarks.case import gather
 from pred import ops
 from pred.ops import reference
 
@@ -131,13 +132,7 @@ def by_element(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        gathered: dict[str, Any] = {}
-        for name, value in named.items():
-            if name.endswith("]"):
-                gathered.setdefault(name.partition("[")[0], []).append(value)
-            else:
-                gathered[name] = value
-        return function(*arguments, **gathered)
+        return function(*arguments, **gather(named))
 
     return call
 
