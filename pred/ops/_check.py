@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 
 import torch
@@ -88,7 +89,11 @@ def check_count(op: str, name: str, value: int, least: int = 0) -> None:
     """``value`` must be an integer of at least ``least``. In a compiled graph it is not looked at, as above."""
     if torch.compiler.is_compiling():
         return
-    if isinstance(value, (bool, Tensor)) or not hasattr(value, "__index__"):
+    try:
+        whole = not isinstance(value, (bool, Tensor)) and operator.index(value) == value
+    except TypeError:  # arrays of several numbers have an __index__ too
+        whole = False
+    if not whole:
         raise TypeError(f"{op}: {name} must be an integer, got {type(value).__name__}")
     if value < least:
         raise ValueError(f"{op}: {name} must be at least {least}, got {value}")

@@ -125,13 +125,15 @@ def check_voxelize_arguments(
 
 def _floats(op: str, name: str, values: Sequence[float], count: int) -> list[float]:
     try:
-        values = list(values)
-    except TypeError:  # a tensor or array of no dimensions too, which is an Iterable all the same
+        size = len(values)
+    except TypeError:  # a tensor or array of no dimensions too
         raise TypeError(f"{op}: {name} must hold {count} numbers, got {type(values).__name__}") from None
+    if size != count:  # before a tensor of any size is made a list
+        raise ValueError(f"{op}: {name} must hold {count} finite numbers, got {size}")
     for value in values:
         check_number(op, name, value)
     floats = [float(value) for value in values]
-    if len(floats) != count or not all(math.isfinite(value) for value in floats):
+    if not all(math.isfinite(value) for value in floats):
         raise ValueError(f"{op}: {name} must hold {count} finite numbers, got {floats}")
     return floats
 
