@@ -7,8 +7,9 @@ instead; the library itself knows nothing of it. Of calls with equal shapes and 
 the op got it. A hook on its outputs notes which of them a gradient reaches.
 
 The file is made by ``torch.save`` and loads with ``weights_only=True``: ``{"schema", "source", "versions", "calls"}``;
-each call has ``op``, ``arguments`` (by name; tensors and plain values; ``name[0]`` ... for those in a list), ``differentiable`` (names of the tensors that
-require a gradient), ``used`` (positions of the outputs that get one) and ``times`` (calls alike).
+each call has ``op``, ``arguments`` (by name, ``name[0]`` ... where they stand in a list; tensors and plain values),
+``differentiable`` (names of the tensors that require a gradient), ``used`` (positions of the outputs that get one) and
+``times`` (calls alike).
 """
 
 from __future__ import annotations

@@ -10,11 +10,11 @@ map's projection takes C h per cell, its backward pass twice as much. What is co
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from benchmarks import cases
 from benchmarks.case import BACKWARD, FORWARD, Case, Function, Phase, Variant
@@ -39,11 +39,7 @@ def _decode_field_cases(sizes: Sizes) -> list[Case]:
         sdf_scale_m=SDF_SCALE_M,
     )
     field = FieldDecoder(sizes.bev_channels, config, POINT_RANGE_M)
-    layers = [
-        parameter.detach()
-        for layer in cast("Sequence[nn.Linear]", field.layers)
-        for parameter in (layer.weight, layer.bias)
-    ]
+    layers = [parameter.detach() for parameter in field.parameters()]  # weight, bias, weight ...
     inputs = (bev, points, *layers)
     samples, width, hidden = points.shape[1], 3 + 6 * FREQUENCIES, sizes.step_hidden
     trunk, rows = width * hidden + (config.layers - 2) * hidden**2, (1 + sizes.classes) * hidden

@@ -101,8 +101,8 @@ static inline __attribute__((always_inline)) auto load_packed(const S* from) {
   return v;
 }
 
-// As store_values, for rows that products read. Where there is a dot-product instruction, which takes subnormal bfloat16
-// for 0, they are stored as 0.
+// As store_values, for rows that products read. Where there is a dot-product instruction, which takes subnormal
+// bfloat16 for 0, they are stored as 0.
 template <int N, typename S>
 static inline __attribute__((always_inline)) void store_factors(S* to, Vec<Compute<S>, N> values) {
 #if defined(__AVX512BF16__)

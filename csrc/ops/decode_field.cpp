@@ -228,8 +228,8 @@ Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor
 std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
     std::optional<Tensor> grad_sdf, std::optional<Tensor> grad_semantics, std::optional<Tensor> grad_gradient,
     const Tensor& projected, const Tensor& points, const Tensor& parameters, const Tensor& activation,
-    const Tensor& slope, const Tensor& chain, std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
-    double sdf_scale, bool need_projected, bool need_points, bool need_parameters) {
+    const Tensor& slope, const Tensor& chain, std::vector<int64_t> widths, std::vector<double> point_range,
+    int64_t octaves, double beta, double sdf_scale, bool need_projected, bool need_points, bool need_parameters) {
   const char* op = "decode_field_backward";
   return PRED_DISPATCH_FIELD(op, projected.scalar_type(), [&] {
     using T = Compute<S>;

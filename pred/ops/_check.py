@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 
 import torch
@@ -88,13 +89,15 @@ def check_number(op: str, name: str, value: object) -> None:
 def check_floats(op: str, name: str, values: Sequence[float], count: int) -> list[float]:
     """``count`` finite numbers."""
     try:
-        values = list(values)
-    except TypeError:  # a tensor or array of no dimensions too, which is an Iterable all the same
+        size = len(values)
+    except TypeError:  # a tensor or array of no dimensions too
         raise TypeError(f"{op}: {name} must hold {count} numbers, got {type(values).__name__}") from None
+    if size != count:  # before a tensor of any size is made a list
+        raise ValueError(f"{op}: {name} must hold {count} finite numbers, got {size}")
     for value in values:
         check_number(op, name, value)
     floats = [float(value) for value in values]
-    if len(floats) != count or not all(math.isfinite(value) for value in floats):
+    if not all(math.isfinite(value) for value in floats):
         raise ValueError(f"{op}: {name} must hold {count} finite numbers, got {floats}")
     return floats
 
@@ -103,7 +106,11 @@ def check_count(op: str, name: str, value: int, least: int = 0) -> None:
     """``value`` must be an integer of at least ``least``. In a compiled graph it is not looked at, as above."""
     if torch.compiler.is_compiling():
         return
-    if isinstance(value, (bool, Tensor)) or not hasattr(value, "__index__"):
+    try:
+        whole = not isinstance(value, (bool, Tensor)) and operator.index(value) == value
+    except TypeError:  # arrays of several numbers have an __index__ too
+        whole = False
+    if not whole:
         raise TypeError(f"{op}: {name} must be an integer, got {type(value).__name__}")
     if value < least:
         raise ValueError(f"{op}: {name} must be at least {least}, got {value}")

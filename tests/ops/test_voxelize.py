@@ -217,6 +217,8 @@ def test_errors(backend: str) -> None:
         voxelize(points, torch.tensor([0, 7, 5, 10]), SIZES[0], RANGE)
     with pytest.raises(TypeError, match="voxelize: voxel_size must hold 3 numbers, got Tensor"):
         voxelize(points, offsets, torch.tensor(0.3), RANGE)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="voxelize: voxel_size must hold 3 finite numbers, got 17179869184"):
+        voxelize(points, offsets, torch.ones(1).expand(1 << 34), RANGE)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="voxelize: voxel_size must hold 3 finite numbers, got"):
         voxelize(points, offsets, (0.1, 0.1), RANGE)
     with pytest.raises(ValueError, match="voxelize: point_range must hold 6 finite numbers, got"):
