@@ -114,6 +114,7 @@ def check_phase(
             traffic_bytes=phase.traffic_bytes,
             work=phase.work,
             flop=phase.flop,
+            flop_dtype=phase.flop_dtype,
             targets=phase.targets,
         )
         if kind == "ours" and (reason := missing_kernel(case.op)):

@@ -5,7 +5,7 @@
 Per step: 512 depth rays (with the Eikonal term) and 512 semantic rays, each with a coarse pass, resampling to 96 + 128
 samples, decoding, compositing and losses; then the backward pass to the map and to every parameter. Contenders:
 
-``ours``       `pred.models` on the compiled kernels
+``ours``       `pred.models` on the compiled kernels; also with the decoder's ``recompute`` and ``bf16``
 ``reference``  the same model on the PyTorch references of `pred.ops`
 ``eager``      plain PyTorch as one would write it first: `F.grid_sample`, and the SDF's gradient by
                `autograd.grad(create_graph=True)`
@@ -28,6 +28,8 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -46,8 +48,9 @@ from pred.models.field import FieldConfig, FieldDecoder
 from pred.models.renderer import Renderer, RendererConfig, Sharpness
 from pred.ops import DecodedField
 
-LOSS_TOLERANCE = 1e-4
-GRADIENT_TOLERANCE = 1e-3
+STEP = "rendering_step"
+TOLERANCES = {"float32": (1e-4, 1e-3), "bfloat16": (1e-2, 1e-1)}
+"""Of the loss, and of a gradient's norm."""
 ROUNDS = 3
 CONTENDERS = ("ours", "eager", "compiled")
 
@@ -100,9 +103,9 @@ class Rays:
 class Step:
     """One rendering step: map, rays, and the models."""
 
-    def __init__(self, sizes: Sizes, field_type: type[FieldDecoder]) -> None:
+    def __init__(self, sizes: Sizes, field_type: type[FieldDecoder], **options: Any) -> None:
         torch.manual_seed(0)
-        config = FieldConfig(hidden=sizes.step_hidden, num_classes=sizes.classes)
+        config = FieldConfig(hidden=sizes.step_hidden, num_classes=sizes.classes, **options)
         self.field = field_type(sizes.bev_channels, config, cases.POINT_RANGE_M)
         self.renderer = Renderer(
             RendererConfig(coarse_samples=sizes.coarse_samples, fine_samples=sizes.fine_samples), cases.POINT_RANGE_M
@@ -141,10 +144,19 @@ class Step:
         return weights.semantic_weight * semantic + weights.depth_weight * depth + weights.eikonal_weight * eikonal
 
 
+VARIANTS: dict[str, dict[str, Any]] = {
+    "ours": {},
+    "ours, recompute": {"recompute": True},
+    "ours, bf16": {"precision": "bf16"},
+    "ours, bf16, recompute": {"precision": "bf16", "recompute": True},
+}
+"""Options of the decoder. Each variant is a case of its own, with the same other contenders."""
+
+
 def contender(name: str, sizes: Sizes) -> Run:
     """One step of a contender; it returns the loss, then the gradients of the map and of every parameter."""
-    step = Step(sizes, PlainField if name == "eager" else FieldDecoder)
-    backend = "native" if name == "ours" else "reference"
+    step = Step(sizes, PlainField if name == "eager" else FieldDecoder, **VARIANTS.get(name, {}))
+    backend = "native" if name in VARIANTS else "reference"
 
     def loss_and_gradients() -> list[Tensor]:
         loss = step.loss()
@@ -192,10 +204,11 @@ def run_step(
     rows: dict[str, Row] = {}
     runs: dict[str, Run] = {}
     expected: list[Tensor] = []
-    for name in ("reference", *(kind for kind in CONTENDERS if kind in kinds)):
+    names = ["reference", *(VARIANTS if "ours" in kinds else ()), *(kind for kind in CONTENDERS[1:] if kind in kinds)]
+    for name in names:
         on_step(f"step, {threads} threads: {name}")
         row = rows[name] = _row(name, sizes, threads)
-        if name == "ours" and (reason := missing_kernel("composite_rays")):
+        if name in VARIANTS and (reason := missing_kernel("composite_rays")):
             row.status = f"missing: {reason}"
             continue
         try:
@@ -205,7 +218,7 @@ def run_step(
             row.status = f"refused: {first_line(error)}"
             continue
         expected = expected or result
-        row.error, wrong = _compare(result, expected)
+        row.error, wrong = _compare(result, expected, TOLERANCES[row.flop_dtype])
         del result
         if wrong:
             row.status = f"wrong: {wrong}"
@@ -218,27 +231,34 @@ def run_step(
         if name != "compiled":  # its compiler's memory would count
             on_step(f"step, {threads} threads: memory of {name}")
             _add_memory(rows[name], sizes_name)
-    return list(rows.values())
+    found = list(rows.values())
+    for name in VARIANTS:
+        if name != "ours" and name in rows:
+            found += [replace(row, case=rows[name].case) for other, row in rows.items() if other not in VARIANTS]
+    return found
 
 
 def _row(name: str, sizes: Sizes, threads: int) -> Row:
     rays, samples = sizes.step_rays, (sizes.coarse_samples, sizes.fine_samples)
+    kind, _, variant = name.partition(", ")
     return Row(
-        op="step",
-        case=f"rendering step {rays} + {rays} rays, {samples[0]} + {samples[1]} samples, hidden {sizes.step_hidden}",
+        op=STEP,
+        case=f"rendering step {rays} + {rays} rays, {samples[0]} + {samples[1]} samples, hidden {sizes.step_hidden}"
+        + (f", {variant}" if variant else ""),
         phase="forward+backward",
         threads=threads,
         contender=name,
-        kind=name,
+        kind=kind,
         unit="rays",
         items=2 * rays,
         work="useful FLOP of the matrix products, see benchmarks/bench_step.py",
         flop=useful_flop(sizes),
-        targets=(Target("eager", 4), Target("eager's memory", 4)) if sizes == cases.REAL else (),
+        flop_dtype="bfloat16" if "bf16" in name else "float32",
+        targets=(Target("eager", 4), Target("eager's memory", 4)) if sizes == cases.REAL and not variant else (),
     )
 
 
-def _compare(actual: list[Tensor], expected: list[Tensor]) -> tuple[float, str]:
+def _compare(actual: list[Tensor], expected: list[Tensor], tolerances: tuple[float, float]) -> tuple[float, str]:
     """Largest relative error of loss and gradients, and what is wrong (nothing: empty)."""
     loss_error = float((actual[0] - expected[0]).abs() / expected[0].abs())
     norms = [float(grad.norm()) for grad in expected[1:]]
@@ -247,9 +267,9 @@ def _compare(actual: list[Tensor], expected: list[Tensor]) -> tuple[float, str]:
         for have, want, norm in zip(actual[1:], expected[1:], norms, strict=True)
     ]
     wrong = ""
-    if not loss_error <= LOSS_TOLERANCE:
+    if not loss_error <= tolerances[0]:
         wrong = f"the loss differs by {loss_error:.2g}"
-    elif not all(error <= GRADIENT_TOLERANCE for error in errors):
+    elif not all(error <= tolerances[1] for error in errors):
         wrong = f"a gradient differs by {max(errors):.2g} of its norm"
     return max(loss_error, *errors), wrong
 

@@ -33,6 +33,8 @@ class Phase:
     work: str = ""
     """Formula of the useful floating-point operations, where they and not the bytes are the limit."""
     flop: int = 0
+    flop_dtype: str = "float32"
+    """Of the products' operands."""
 
 
 @dataclass(frozen=True)

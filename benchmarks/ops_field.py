@@ -54,6 +54,7 @@ def _decode_field_cases(sizes: Sizes) -> list[Case]:
         passes = 2 if with_gradient else 1
         forward = 2 * (samples * (passes * trunk + rows) + project)
         function = _call(ops.decode_field, with_gradient, options)
+        dtype = "bfloat16" if "precision" in options else "float32"
         text = "2 (N (2 m + r h) + C h HW)" if with_gradient else "2 (N (m + r h) + C h HW)"
         found.append(
             Case(
@@ -73,8 +74,8 @@ def _decode_field_cases(sizes: Sizes) -> list[Case]:
                 derivative_of=tuple(range(3 if with_gradient else 2)),
                 tolerance=1e-1 if "precision" in options else 1e-3,
                 phases=(
-                    Phase(FORWARD, "", 0, work=text, flop=forward),
-                    Phase(BACKWARD, "", 0, targets, work=f"3 {text}", flop=3 * forward),
+                    Phase(FORWARD, "", 0, work=text, flop=forward, flop_dtype=dtype),
+                    Phase(BACKWARD, "", 0, targets, work=f"3 {text}", flop=3 * forward, flop_dtype=dtype),
                 ),
             )
         )

@@ -37,7 +37,8 @@ def phases_of(case: Case) -> tuple[Phase, ...]:
                 for total, part in ((phase.traffic, forward.traffic), (phase.work, forward.work))
             )
             left = phase.traffic_bytes - forward.traffic_bytes
-            phases.append(Phase(BACKWARD_ALONE, traffic, left, work=work, flop=phase.flop - forward.flop))
+            flop = phase.flop - forward.flop
+            phases.append(Phase(BACKWARD_ALONE, traffic, left, work=work, flop=flop, flop_dtype=phase.flop_dtype))
         phases.append(phase)
         if phase.name == SECOND:
             phases.append(Phase(SECOND_ALONE, "", 0))  # its share of the bytes is not declared

@@ -43,7 +43,7 @@ PHASES = {
     "farthest_point_sample": {FORWARD},
     "knn": {FORWARD},
     "ball_query": {FORWARD},
-    "step": {BACKWARD},
+    "rendering_step": {BACKWARD},
 }
 FOLLOWING = {BACKWARD: BACKWARD_ALONE, SECOND: SECOND_ALONE}
 
@@ -94,7 +94,7 @@ def test_every_case_runs(tmp_path: Path) -> None:
 
     check_rows(result["rows"])
     for op, phases in PHASES.items():
-        if op != "step":
+        if op != "rendering_step":
             phases = phases | {FOLLOWING[phase] for phase in phases & set(FOLLOWING)}
         assert {row["phase"] for row in result["rows"] if row["op"] == op} == phases
     for row in result["rows"]:
@@ -110,7 +110,7 @@ def test_every_case_runs(tmp_path: Path) -> None:
             assert picture.width >= 1000 and picture.height > 500
     else:
         assert "pip install 'pred-lidar[bench]'" in done.stdout
-    step = {row["contender"]: row for row in result["rows"] if row["op"] == "step"}
+    step = {row["contender"]: row for row in result["rows"] if row["op"] == "rendering_step"}
     assert step["eager"]["peak_memory_bytes"] > 0 and step["reference"]["peak_memory_bytes"] > 0
 
 
@@ -254,7 +254,7 @@ def row(contender: str, kind: str, times: Timing | None, memory: int | None = No
 
 
 def test_comparison_is_with_the_fastest_eager_and_against_the_targets() -> None:
-    ceilings = {2: Ceilings(2, copy_bytes_per_s=1e6, matrix_flop_per_s=1e9)}
+    ceilings = {2: Ceilings(2, copy_bytes_per_s=1e6, matrix_flop_per_s=1e9, bfloat16_flop_per_s=2e9)}
     rows = [
         row("ours", "ours", timing(0.01, 0.02, 0.03), memory=100_000_000),
         row("eager slow", "eager", timing(0.1, 0.1, 0.1)),
@@ -288,7 +288,10 @@ def test_scaling_is_ours_against_fewer_threads() -> None:
     alone = replace(row("ours", "ours", timing(0.038, 0.038, 0.038)), threads=1)
     eager = replace(row("eager", "eager", timing(0.1, 0.1, 0.1)), threads=1)
     rows = [alone, eager, row("ours", "ours", timing(0.02, 0.02, 0.02)), row("eager", "eager", timing(0.1, 0.1, 0.1))]
-    ceilings = {threads: Ceilings(threads, copy_bytes_per_s=1e6, matrix_flop_per_s=1e9) for threads in (1, 2)}
+    ceilings = {
+        threads: Ceilings(threads, copy_bytes_per_s=1e6, matrix_flop_per_s=1e9, bfloat16_flop_per_s=2e9)
+        for threads in (1, 2)
+    }
     first, second = compare(rows, ceilings)
     assert "scaling" not in first and second["scaling"] == {"threads": 1, "ratio": pytest.approx(1.9)}
     assert "1.90x of 1" in comparison_table([first, second]).text()
