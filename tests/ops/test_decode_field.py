@@ -231,6 +231,34 @@ def test_projected_map_gives_the_same(backend: str) -> None:
         assert_close(value, expected, 1e-13)
 
 
+@pytest.mark.parametrize("precision", ["fp64", "fp32", "bf16"])
+@pytest.mark.parametrize("channels, hidden", [(1, 1), (3, 5), (16, 33), (37, 24), (130, 70)])
+@pytest.mark.parametrize("cells", [(1, 1), (1, 11), (13, 97)])
+def test_products(cells: tuple[int, int], channels: int, hidden: int, precision: str, level: str) -> None:
+    """The tiles of every width and height, by a product of matrices and its gradients, which are nothing else."""
+    generator = torch.Generator().manual_seed(channels)
+    stored = torch.bfloat16 if precision == "bf16" else torch.float64 if precision == "fp64" else torch.float32
+    computed = torch.float64 if precision == "fp64" else torch.float32
+    bev = torch.randn(2, channels, *cells, generator=generator, dtype=torch.float64).to(stored)
+    weight = torch.randn(hidden, channels, generator=generator, dtype=torch.float64).to(stored).to(computed)
+    cotangent = torch.randn(2, hidden, *cells, generator=generator, dtype=torch.float64).to(stored)
+    tolerance = {"fp64": 1e-14, "fp32": 1e-6, "bf16": 2.0**-8}[
+        precision
+    ]  # in bf16, operands are exact, results rounded
+
+    def call(bev: Tensor, weight: Tensor, cotangent: Tensor, function: Any) -> dict[str, Tensor]:
+        bev, weight = bev.clone().requires_grad_(), weight.clone().requires_grad_()
+        out = function(bev, weight)
+        grad_bev, grad_weight = torch.autograd.grad(out, (bev, weight), cotangent.to(out))
+        return {"out": out.detach(), "grad_bev": grad_bev, "grad_weight": grad_weight}
+
+    def own(bev: Tensor, weight: Tensor) -> Tensor:
+        return project_bev(bev, weight, "bf16" if precision == "bf16" else "fp32")
+
+    expected = call(bev.double(), weight.double(), cotangent.double(), lambda b, w: torch.einsum("bchw,oc->bohw", b, w))
+    assert_all_close(call(bev, weight, cotangent, own), expected, tolerance)
+
+
 @pytest.mark.parametrize("scale", [100.0, -100.0])
 def test_saturated_softplus(scale: float, level: str) -> None:
     """beta z = +-100 in every unit of the last hidden layer: slopes of 1, and of 4e-44, which float32 calls 0."""
