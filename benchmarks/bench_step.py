@@ -49,8 +49,9 @@ from pred.models.renderer import Renderer, RendererConfig, Sharpness
 from pred.ops import DecodedField
 
 STEP = "rendering_step"
-TOLERANCES = {"float32": (1e-4, 1e-3), "bfloat16": (1e-2, 1e-1)}
-"""Of the loss, and of a gradient's norm."""
+TOLERANCES = {"float32": (1e-4, 1e-3), "bfloat16": (1e-2, 2.5e-1)}
+"""Of the loss, and of a gradient's norm. In bfloat16 the coarse pass puts the fine samples some decimetres elsewhere,
+where the features of this map, which are noise, and the high octaves of the encoding are others."""
 ROUNDS = 3
 CONTENDERS = ("ours", "eager", "compiled")
 

@@ -65,7 +65,8 @@ def check_rows(rows: list[dict[str, Any]]) -> None:
         timing = row["timing"]
         assert 0 < timing["q25_s"] <= timing["median_s"] <= timing["q75_s"], name
         assert timing["samples"] >= len(timing["round_medians_s"]) == 3, name
-        limit = 1e-2 if "bfloat16" in row["case"] else 1e-3  # neighbouring bfloat16 numbers are 4e-3 to 8e-3 apart
+        # Neighbouring bfloat16 numbers are 4e-3 to 8e-3 apart; the decoder's layers add what they round.
+        limit = 5e-2 if ", bf16" in row["case"] else 1e-2 if "bfloat16" in row["case"] else 1e-3
         assert row["error"] is not None and row["error"] < limit, name
         assert row["items"] > 0 and row["rates"]["items_per_s"] == pytest.approx(row["items"] / timing["median_s"])
         assert row["peak_memory_bytes"] is None or row["peak_memory_bytes"] >= 0, name

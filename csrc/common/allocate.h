@@ -15,10 +15,11 @@
 namespace pred {
 
 // Pages of 2 MiB for large memory that is about to be written from end to end: with pages of 4 KiB their first touch
-// costs several times the writing. A hint, which the system need not take.
+// costs several times the writing. A hint, which the system need not take. Smaller blocks may lie on the heap, which
+// would keep the hint when they are freed; glibc maps larger ones by themselves.
 inline void prefer_large_pages([[maybe_unused]] void* memory, [[maybe_unused]] int64_t bytes) {
 #ifdef MADV_HUGEPAGE
-  constexpr int64_t kLarge = int64_t(8) << 20;
+  constexpr int64_t kLarge = int64_t(32) << 20;
   constexpr uintptr_t kPage = uintptr_t(2) << 20;
   if (bytes < kLarge) return;
   const uintptr_t begin = (uintptr_t(memory) + kPage - 1) / kPage * kPage;
