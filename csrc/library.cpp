@@ -51,10 +51,10 @@ STABLE_TORCH_LIBRARY(pred, m) {
   m.def(
       "decode_field(Tensor projected, Tensor points, Tensor parameters, SymInt[] widths, float[] point_range, "
       "SymInt octaves, float beta, float sdf_scale, bool with_gradient, bool keep) -> "
-      "(Tensor sdf, Tensor semantics, Tensor gradient, Tensor activation, Tensor slope, Tensor chain)");
+      "(Tensor sdf, Tensor semantics, Tensor gradient, Tensor activation, Tensor chain)");
   m.def(
       "decode_field_backward(Tensor? grad_sdf, Tensor? grad_semantics, Tensor? grad_gradient, Tensor projected, "
-      "Tensor points, Tensor parameters, Tensor activation, Tensor slope, Tensor chain, SymInt[] widths, "
+      "Tensor points, Tensor parameters, Tensor activation, Tensor chain, SymInt[] widths, "
       "float[] point_range, SymInt octaves, float beta, float sdf_scale, bool need_projected, bool need_points, "
       "bool need_parameters) -> (Tensor, Tensor, Tensor)");
 

@@ -191,7 +191,7 @@ struct Field {
   }
 };
 
-using Outputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Outputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor& parameters,
                      std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
@@ -209,9 +209,8 @@ Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor
       prefer_large_pages(tensor.mutable_data_ptr(), tensor.numel() * int64_t(sizeof(S)));
       return tensor;
     };
-    Tensor activation = kept(layers), slope = kept(layers), chain = kept(with_gradient ? layers - 1 : 0);
+    Tensor activation = kept(layers), chain = kept(with_gradient ? layers - 1 : 0);
     const FieldSaved<S> saved{keep ? mutable_storage<S>(activation) : nullptr,
-                              keep ? mutable_storage<S>(slope) : nullptr,
                               keep && with_gradient ? mutable_storage<S>(chain) : nullptr};
     const FieldOutputs<S> out{sdf.mutable_data_ptr<T>(), semantics.mutable_data_ptr<T>(),
                               with_gradient ? gradient.mutable_data_ptr<T>() : nullptr};
@@ -221,15 +220,15 @@ Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor
       const auto scratch = allocate_array<char>(k.scratch_bytes(in.args, false));
       k.forward(in.args, saved, out, scratch.get(), tasks.begin(first), tasks.end(last - 1), in.num_samples);
     });
-    return Outputs(sdf, semantics, gradient, activation, slope, chain);
+    return Outputs(sdf, semantics, gradient, activation, chain);
   });
 }
 
 std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
     std::optional<Tensor> grad_sdf, std::optional<Tensor> grad_semantics, std::optional<Tensor> grad_gradient,
     const Tensor& projected, const Tensor& points, const Tensor& parameters, const Tensor& activation,
-    const Tensor& slope, const Tensor& chain, std::vector<int64_t> widths, std::vector<double> point_range,
-    int64_t octaves, double beta, double sdf_scale, bool need_projected, bool need_points, bool need_parameters) {
+    const Tensor& chain, std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
+    double sdf_scale, bool need_projected, bool need_points, bool need_parameters) {
   const char* op = "decode_field_backward";
   return PRED_DISPATCH_FIELD(op, projected.scalar_type(), [&] {
     using T = Compute<S>;
@@ -255,10 +254,8 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
       return mutable_storage<S>(kept.back());
     };
     const FieldSaved<S> saved{saved_rows("activation", activation, in.args.num_hidden),
-                              saved_rows("slope", slope, in.args.num_hidden),
                               saved_rows("chain", chain, in.args.num_hidden - 1)};
-    PRED_CHECK((saved.activation == nullptr) == (saved.slope == nullptr), op,
-               ": slope must be given with activation, got one of them");
+    PRED_CHECK(saved.activation || !saved.chain, op, ": activation must be given with chain, got none");
 
     const int64_t width = in.args.map.channels, layers = in.args.num_hidden + 1;
     const bool along = need_projected && grad.gradient;

@@ -56,11 +56,11 @@ struct FieldArgs {
   const T* sdf_row;  // [width] sdf_scale W_o[0], padded by zeros to the stride
 };
 
-// What the forward pass keeps: activations a_l and slopes s_l [L, B N, stride], and chain [L - 1, B N, stride], the g_l
-// but for the last, where there is a gradient. Null where nothing is kept.
+// What the forward pass keeps: activations a_l [L, B N, stride], from which the slopes follow, and chain [L - 1, B N,
+// stride], the g_l but for the last, where there is a gradient. Null where nothing is kept.
 template <typename S>
 struct FieldSaved {
-  S *activation, *slope, *chain;
+  S *activation, *chain;
 };
 
 template <typename S>

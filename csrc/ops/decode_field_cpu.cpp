@@ -76,7 +76,6 @@ struct Tile {
   void use_saved(const FieldSaved<S>& saved, int64_t num_samples, int64_t begin, bool with_chain) {
     for (int64_t l = 0; l < layers; ++l) {
       activation[l] = saved.activation + (l * num_samples + begin) * stride;
-      slope[l] = saved.slope + (l * num_samples + begin) * stride;
       if (with_chain && l + 1 < layers) chain[l] = saved.chain + (l * num_samples + begin) * stride;
     }
   }
@@ -211,6 +210,21 @@ static void activations(const FieldArgs<S>& a, const Tile<S>& tile, int64_t coun
       product(tile.encoding, tile.encoding_stride, count, tile.encoding_columns, a.first, tile.width, epilogue);
     } else {
       product(tile.activation[l - 1], stride, count, tile.width, a.up[l], tile.width, epilogue);
+    }
+  }
+}
+
+// s_l from a_l that was kept: 1 - exp(-beta a).
+template <typename S, typename T = Compute<S>>
+static void slopes(const Tile<S>& tile, int64_t count) {
+  constexpr int W = kWidth<T>;
+  for (int64_t l = 0; l < tile.layers; ++l) {
+    for (int64_t r = 0; r < count; ++r) {
+      for (int64_t c = 0; c < tile.columns; c += W) {
+        const int64_t at = r * tile.stride + c;
+        const auto value = load_values<W>(tile.activation[l] + at);
+        store_factors<W>(tile.slope[l] + at, -exp_nonpositive(tile.beta.beta, -value).expm1);
+      }
     }
   }
 }
@@ -444,6 +458,7 @@ static void backward(const FieldArgs<S>& a, const FieldSaved<S>& saved, const Fi
     read_cotangents(a, tile, grad, first, count);
     if (saved.activation) {
       tile.use_saved(saved, num_samples, first, saved.chain != nullptr);
+      slopes(tile, count);
     } else {
       gather<false>(a, tile, first, count);
       activations(a, tile, count);

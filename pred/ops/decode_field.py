@@ -140,8 +140,8 @@ def decode_field(
         projected: ``bev`` is :func:`project_bev` of the map, ``[B, hidden, H, W]``.
         precision: of products and of what is kept for the backward pass, for float32: ``"bf16"`` rounds their
             operands to bfloat16 and sums in float32; parameters and their gradients stay float32.
-        recompute: keep nothing for the backward pass but the arguments; else two rows per hidden layer and sample,
-            and with ``with_gradient`` a third one for all but the last.
+        recompute: keep nothing for the backward pass but the arguments; else a row per hidden layer and sample, and
+            with ``with_gradient`` a second one for all but the last. Results differ by rounding.
 
     Returns:
         :class:`DecodedField` in the dtype of ``points``.
@@ -433,7 +433,6 @@ def _fake(
         points.new_empty(frames, count, widths[-1] - 1),
         points.new_empty(frames, count if with_gradient else 0, 3),
         kept(hidden),
-        kept(hidden),
         kept(hidden - 1 if with_gradient else 0),
     )
 
@@ -467,7 +466,6 @@ def _backward_fake(
     points: Tensor,
     parameters: Tensor,
     activation: Tensor,
-    slope: Tensor,
     chain: Tensor,
     widths: Sequence[int],
     point_range: Sequence[float],
