@@ -8,7 +8,7 @@ and from some that differ by 1e-7 of themselves, with the same data, rays and sc
 rounding part as any two neighbouring runs do; how far, the spread of the references' runs tells. Of every loss term the
 mean over the last steps of a contender's runs is compared with that of the references.
 
-A cell agrees where it lies within its bound: 2 % for float32 and 5 % for bfloat16, or twice the spread if that is more.
+A cell agrees where it lies within its bound: 2 % or, if that is more, twice the spread for float32, 5 % for bfloat16.
 """
 
 from __future__ import annotations
@@ -96,8 +96,7 @@ def tabulate(means: Mapping[str, Mapping[str, Sequence[float]]]) -> list[dict[st
         first, reference = means["reference"][term][0], statistics.mean(means["reference"][term])
         spread = max(abs(value / first - 1) for value in means["reference"][term])
         row: dict[str, Any] = {"term": term, "reference": reference, "spread": spread}
-        for name, least in (("fp32", 0.02), ("bf16", 0.05)):
-            bound = max(least, 2 * spread)
+        for name, bound in (("fp32", max(0.02, 2 * spread)), ("bf16", 0.05)):
             difference = statistics.mean(means[name][term]) / reference - 1
             row[name] = {"difference": difference, "bound": bound, "agrees": abs(difference) <= bound}
         table.append(row)

@@ -14,7 +14,7 @@ samples, decoding, compositing and losses; then the backward pass to the map and
 Useful arithmetic, in multiply-adds (P encoding width, h hidden, L Linear layers, C map channels, K classes): the
 trunk takes m = P h + (L - 2) h^2 per sample, the output row(s) h each; the first layer's share of the map takes
 C h per cell. A backward pass takes twice its forward pass, and the SDF's gradient is one more pass through the trunk.
-Coarse samples: m + h. Depth samples: 3 (m + h) + 3 (m + h). Semantic samples: 3 (m + (1 + K) h). Map: 3 C h per cell.
+Coarse samples: m + h. Depth samples: 3 (m + h) + 3 m. Semantic samples: 3 (m + (1 + K) h). Map: 3 C h per cell.
 Softplus, gathers and compositing are not counted, nor is anything computed twice.
 
 ``python -m benchmarks.bench_step CONTENDER SIZES THREADS`` prints the memory that one step adds, in bytes: a process of
@@ -180,7 +180,7 @@ def useful_flop(sizes: Sizes) -> int:
     samples = sizes.coarse_samples + sizes.fine_samples
     per_ray_pair = (
         2 * sizes.coarse_samples * (trunk + hidden)
-        + samples * 6 * (trunk + hidden)
+        + samples * (6 * trunk + 3 * hidden)
         + samples * 3 * (trunk + (1 + config.num_classes) * hidden)
     )
     return 2 * (sizes.step_rays * per_ray_pair + 3 * sizes.bev_cells**2 * sizes.bev_channels * hidden)

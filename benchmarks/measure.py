@@ -195,7 +195,7 @@ class Ceilings:
             "copy": f"torch copy_ of {COPY_BYTES} bytes, counted once as read and once as written; best block",
             "matrix": f"products of matrices in cache, best block of the faster of two: float32, or bfloat16 summed in "
             f"float32, of {MATRIX_SIZE} x {MATRIX_SIZE} by torch.mm, of {OWN_ROWS} x {OWN_SIZE} with {OWN_SIZE} x "
-            f"{OWN_SIZE} by pred's own kernel",
+            f"{OWN_SIZE} by project_bev, its packing and copies included",
         }
 
 

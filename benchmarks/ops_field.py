@@ -85,11 +85,11 @@ def _decode_field_cases(sizes: Sizes) -> list[Case]:
 def _points(sizes: Sizes) -> Tensor:
     """Samples along rays, in metres, off the lines through cell centres."""
     plan = cases.ray_grid(sizes, seed=1)
-    half = torch.tensor(POINT_RANGE_M[3:]) - torch.tensor(POINT_RANGE_M[:3])
+    extent = torch.tensor(POINT_RANGE_M[3:]) - torch.tensor(POINT_RANGE_M[:3])
     generator = torch.Generator().manual_seed(2)
     height = 2 * torch.rand(*plan.shape[:2], 1, generator=generator) - 1
     centre = (torch.tensor(POINT_RANGE_M[3:]) + torch.tensor(POINT_RANGE_M[:3])) / 2
-    return torch.cat([plan, height], dim=-1) * half / 2 + centre
+    return torch.cat([plan, height], dim=-1) * extent / 2 + centre
 
 
 def _outputs(field: DecodedField) -> tuple[Tensor, ...]:

@@ -66,7 +66,8 @@ def check_rows(rows: list[dict[str, Any]]) -> None:
         assert 0 < timing["q25_s"] <= timing["median_s"] <= timing["q75_s"], name
         assert timing["samples"] >= len(timing["round_medians_s"]) == 3, name
         # Neighbouring bfloat16 numbers are 4e-3 to 8e-3 apart; the decoder's layers add what they round.
-        limit = 5e-2 if ", bf16" in row["case"] else 1e-2 if "bfloat16" in row["case"] else 1e-3
+        half = 0.25 if row["op"] == "rendering_step" else 5e-2  # see TOLERANCES there
+        limit = half if ", bf16" in row["case"] else 1e-2 if "bfloat16" in row["case"] else 1e-3
         assert row["error"] is not None and row["error"] < limit, name
         assert row["items"] > 0 and row["rates"]["items_per_s"] == pytest.approx(row["items"] / timing["median_s"])
         assert row["peak_memory_bytes"] is None or row["peak_memory_bytes"] >= 0, name
@@ -220,10 +221,10 @@ def test_traffic_formulas() -> None:
 def test_useful_flop() -> None:
     trunk, head = 39 * 256 + 2 * 256**2, 256  # 141 056 multiply-adds, and 256 per output row
     coarse = 2 * 96 * (trunk + head)
-    depth = 224 * 6 * (trunk + head)
+    depth = 224 * (6 * trunk + 3 * head)
     semantic = 224 * 3 * (trunk + 20 * head)
-    assert coarse + depth + semantic == 315_285_504
-    assert bench_step.useful_flop(REAL) == 2 * (512 * 315_285_504 + 3 * 32_400 * 128 * 256)
+    assert coarse + depth + semantic == 315_113_472
+    assert bench_step.useful_flop(REAL) == 2 * (512 * 315_113_472 + 3 * 32_400 * 128 * 256)
 
 
 def timing(*round_medians_s: float) -> Timing:

@@ -9,6 +9,7 @@
 #include <cstdint>
 
 #include "common/parallel.h"
+#include "common/tile.h"
 
 namespace pred {
 
@@ -20,12 +21,13 @@ struct Blocks {
   int64_t end(int64_t block) const { return std::min(rows, (block + 1) * size); }
 };
 
-// For products over tiles of 96 rows: tasks that write their own rows only, and blocks that have sums of their own, of
-// which there are few, since the sums of all of them are held.
-inline Blocks product_tasks(int64_t rows) { return {rows, 960}; }
-inline Blocks product_sums(int64_t rows) {
-  constexpr int64_t kLeast = 1920, kMaxBlocks = 64;
-  return {rows, std::max<int64_t>(1, (rows + kLeast * kMaxBlocks - 1) / (kLeast * kMaxBlocks)) * kLeast};
+// Whole tiles, which are cut alike whoever cuts them. Tasks write their own rows only; blocks have sums of their own,
+// all of which are held, in kHeldBytes or in eight blocks.
+inline Blocks product_tasks(int64_t rows) { return {rows, 10 * kRowTile}; }
+inline Blocks product_sums(int64_t rows, int64_t bytes_per_block) {
+  constexpr int64_t kLeast = 20 * kRowTile, kHeldBytes = int64_t(256) << 20;
+  const int64_t blocks = std::clamp<int64_t>(kHeldBytes / std::max<int64_t>(1, bytes_per_block), 8, 64);
+  return {rows, std::max<int64_t>(1, (rows + kLeast * blocks - 1) / (kLeast * blocks)) * kLeast};
 }
 
 // out[row, column] = the sum over blocks, in order, of sums[block * block_stride + row * row_stride + column].

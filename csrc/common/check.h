@@ -114,7 +114,7 @@ T read_sharpness(const char* op, const Tensor& inv_s, ScalarType dtype) {
     }                                                                                                           \
   }()
 
-// Calls `body` with S, float, double or BFloat16, and T = Compute<S>.
+// Calls the body with S: float, double or BFloat16.
 #define PRED_DISPATCH_FIELD(op, dtype, ...)                                                            \
   [&] {                                                                                                \
     switch (dtype) {                                                                                   \

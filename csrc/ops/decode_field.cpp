@@ -19,15 +19,7 @@
 namespace pred {
 namespace {
 
-template <typename S>
-const FieldKernels<S>& field_kernels() {
-  if constexpr (std::is_same_v<S, float>)
-    return PRED_KERNELS(decode_field_f32);
-  else if constexpr (std::is_same_v<S, double>)
-    return PRED_KERNELS(decode_field_f64);
-  else
-    return PRED_KERNELS(decode_field_bf16);
-}
+PRED_KERNELS_BY_FACTOR(FieldKernels, decode_field)
 
 template <typename S>
 struct Field {
@@ -57,8 +49,8 @@ struct Field {
     const int64_t layers = int64_t(widths.size()) - 1, width = map_in.size(1);
     PRED_CHECK(layers >= 2 && layers <= kMaxHidden + 1, op, ": widths must name 2 to ", kMaxHidden + 1, " layers, got ",
                layers);
-    PRED_CHECK(octaves >= 0 && octaves <= 20 && widths[0] == 3 + 6 * octaves, op,
-               ": widths must start with 3 + 6 octaves, octaves in [0, 20], got ", widths[0]);
+    PRED_CHECK(octaves >= 0 && octaves <= 16 && widths[0] == 3 + 6 * octaves, op,
+               ": widths must start with 3 + 6 octaves, octaves in [0, 16], got ", widths[0]);
     int64_t expected = 0;
     for (int64_t l = 0; l < layers; ++l) {
       const bool fits = l + 1 < layers ? widths[l + 1] == width : widths[l + 1] >= 1 && widths[l + 1] < 1 << 20;
@@ -69,7 +61,8 @@ struct Field {
     PRED_CHECK(parameters_in.size(0) == expected, op, ": parameters must have ", expected, " elements, got ",
                parameters_in.size(0));
     PRED_CHECK(point_range.size() == 6, op, ": point_range must hold 6 numbers, got ", point_range.size());
-    PRED_CHECK(beta > 0 && sdf_scale > 0, op, ": beta and sdf_scale must be positive, got ", beta, " and ", sdf_scale);
+    PRED_CHECK(beta > 0, op, ": beta must be positive, got ", beta);
+    PRED_CHECK(sdf_scale > 0, op, ": sdf_scale must be positive, got ", sdf_scale);
 
     map = torch::stable::contiguous(map_in, torch::headeronly::MemoryFormat::ChannelsLast);
     points = torch::stable::contiguous(points_in);
@@ -84,7 +77,7 @@ struct Field {
     pack_parameters();
   }
 
-  int64_t columns(int64_t layer) const { return field_kernels<S>().columns(widths[layer]); }
+  int64_t columns(int64_t layer) const { return kernels<S>().columns(widths[layer]); }
 
   // Nothing kept has no rows either: torch cannot copy some shapes of no elements.
   std::vector<int64_t> saved_shape(int64_t layers) const {
@@ -110,7 +103,9 @@ struct Field {
     for (int axis = 0; axis < 3; ++axis) {
       args.centre[axis] = T((point_range[axis] + point_range[axis + 3]) / 2);
       args.half_extent[axis] = T((point_range[axis + 3] - point_range[axis]) / 2);
-      PRED_CHECK(args.half_extent[axis] > 0, op, ": point_range must have its upper bounds above its lower ones");
+      PRED_CHECK(args.half_extent[axis] > 0, op,
+                 ": point_range must have its upper bounds above its lower ones in the ", "dtype of points, got ",
+                 point_range[axis], " and ", point_range[axis + 3]);
     }
     auto& m = args.map;
     m.map = storage<S>(map);
@@ -143,7 +138,7 @@ struct Field {
   }
 
   void pack_parameters() {
-    const FieldKernels<S>& k = field_kernels<S>();
+    const FieldKernels<S>& k = kernels<S>();
     const int64_t layers = args.num_hidden + 1, parts = kFieldParts<S> * widths[0];
     int64_t size = kFieldParts<S> > 1 ? k.packed_size(parts, widths[1]) : 0;
     for (int64_t l = 0; l < layers; ++l) {
@@ -214,7 +209,7 @@ Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor
                               keep && with_gradient ? mutable_storage<S>(chain) : nullptr};
     const FieldOutputs<S> out{sdf.mutable_data_ptr<T>(), semantics.mutable_data_ptr<T>(),
                               with_gradient ? gradient.mutable_data_ptr<T>() : nullptr};
-    const FieldKernels<S>& k = field_kernels<S>();
+    const FieldKernels<S>& k = kernels<S>();
     const Blocks tasks = product_tasks(in.num_samples);
     parallel(tasks.count(), 1, [&](int64_t first, int64_t last) {
       const auto scratch = allocate_array<char>(k.scratch_bytes(in.args, false));
@@ -269,10 +264,10 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
     // Each block's sums: dW [outputs, columns] and db of one layer after the other.
     int64_t block_sums = 0;
     for (int64_t l = 0; l < layers; ++l) block_sums += widths[l + 1] * (in.columns(l) + 1);
-    const Blocks blocks = product_sums(in.num_samples);
+    const Blocks blocks = product_sums(in.num_samples, block_sums * int64_t(sizeof(T)));
     std::unique_ptr<T[]> sums;
     if (need_parameters) sums = allocate_array<T>(blocks.count() * block_sums);
-    const FieldKernels<S>& k = field_kernels<S>();
+    const FieldKernels<S>& k = kernels<S>();
     parallel(blocks.count(), 1, [&](int64_t first, int64_t last) {
       const auto scratch = allocate_array<char>(k.scratch_bytes(in.args, true));
       for (int64_t block = first; block < last; ++block) {

@@ -76,7 +76,7 @@ struct FieldCotangents {
 // Gradients; null where not wanted.
 template <typename S>
 struct FieldGradients {
-  Compute<S>* parameters;  // one block's part: dW_l [width, columns], db_l [width] for each layer; see FieldSizes
+  Compute<S>* parameters;  // one block's part: dW_l [width, columns], db_l [width] for each layer
   S* along_map;            // [B N, width] x_1
   S* along_slope;          // [B N, width] g_1, with a cotangent of the gradient
   Compute<S>* directions;  // [B N, 2] v of the map's axes, with a cotangent of the gradient

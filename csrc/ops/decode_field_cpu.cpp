@@ -4,6 +4,7 @@
 // A tile of samples goes through all layers before the next one, so that its rows stay in cache; bias, Softplus and its
 // derivatives are epilogues of the products. One iteration owns the samples of its range.
 #include "common/allocate.h"
+#include "common/tile.h"
 #include "math/product.h"
 #include "math/softplus.h"
 #include "ops/decode_field.h"
@@ -11,8 +12,6 @@
 
 namespace pred::PRED_ISA {
 namespace {
-
-constexpr int64_t kTile = 96;  // samples
 
 template <typename S>
 struct Tile {
@@ -44,13 +43,13 @@ struct Tile {
     layers = a.num_hidden;
     beta = softplus_scale(a.beta);
     beta_value = a.beta;
-    const int64_t rows = kTile * stride;
-    encoding = arena.take<S>(kTile * encoding_stride);
+    const int64_t rows = kRowTile * stride;
+    encoding = arena.take<S>(kRowTile * encoding_stride);
     gathered = arena.take<S>(rows);
-    few = arena.take<T>(kTile * few_stride);
-    sine = arena.take<T>(kTile * angles);
-    cosine = arena.take<T>(kTile * angles);
-    stencil = arena.take<LinearStencil<T, 2>>(kTile);
+    few = arena.take<T>(kRowTile * few_stride);
+    sine = arena.take<T>(kRowTile * angles);
+    cosine = arena.take<T>(kRowTile * angles);
+    stencil = arena.take<LinearStencil<T, 2>>(kRowTile);
     for (int64_t l = 0; l < layers; ++l) {
       activation[l] = arena.take<S>(rows);
       slope[l] = arena.take<S>(rows);
@@ -61,13 +60,13 @@ struct Tile {
         rate[l] = arena.take<S>(rows);
         back[l] = arena.take<S>(rows);
       }
-      encoding_rate = arena.take<S>(kTile * rate_stride);
-      output = arena.take<S>(kTile * output_stride);
-      few_chain = arena.take<T>(kTile * few_stride);
-      direction = arena.take<T>(kTile * 3);
+      encoding_rate = arena.take<S>(kRowTile * rate_stride);
+      output = arena.take<S>(kRowTile * output_stride);
+      few_chain = arena.take<T>(kRowTile * few_stride);
+      direction = arena.take<T>(kRowTile * 3);
       const int64_t wide = few_stride > stride ? few_stride : stride;
       const int64_t widest = encoding_stride > wide ? encoding_stride : wide;
-      for (S*& buffer : interleaved) buffer = arena.take<S>(kPair<S> > 1 ? kTile * widest : 0);
+      for (S*& buffer : interleaved) buffer = arena.take<S>(kPair<S> > 1 ? kRowTile * widest : 0);
     }
     end = arena.at;
   }
@@ -301,8 +300,8 @@ template <typename S>
 static void forward(const FieldArgs<S>& a, const FieldSaved<S>& saved, const FieldOutputs<S>& out, char* scratch,
                     int64_t begin, int64_t end, int64_t num_samples) {
   Tile<S> tile(a, false, scratch);
-  for (int64_t first = begin; first < end; first += kTile) {
-    const int64_t count = end - first < kTile ? end - first : kTile;
+  for (int64_t first = begin; first < end; first += kRowTile) {
+    const int64_t count = end - first < kRowTile ? end - first : kRowTile;
     if (saved.activation) tile.use_saved(saved, num_samples, first, out.gradient != nullptr);
     encode(a, tile, first, count);
     gather<false>(a, tile, first, count);
@@ -449,11 +448,10 @@ static void read_cotangents(const FieldArgs<S>& a, const Tile<S>& tile, const Fi
 template <typename S>
 static void backward(const FieldArgs<S>& a, const FieldSaved<S>& saved, const FieldCotangents<S>& grad,
                      const FieldGradients<S>& out, char* scratch, int64_t begin, int64_t end, int64_t num_samples) {
-  using T = Compute<S>;
   Tile<S> tile(a, true, scratch);
   const bool has_tangents = grad.gradient != nullptr;
-  for (int64_t first = begin; first < end; first += kTile) {
-    const int64_t count = end - first < kTile ? end - first : kTile;
+  for (int64_t first = begin; first < end; first += kRowTile) {
+    const int64_t count = end - first < kRowTile ? end - first : kRowTile;
     encode(a, tile, first, count);
     read_cotangents(a, tile, grad, first, count);
     if (saved.activation) {
@@ -479,7 +477,7 @@ static void backward(const FieldArgs<S>& a, const FieldSaved<S>& saved, const Fi
         out.along_slope[at + c] = tile.chain[0][r * tile.stride + c];
       }
       for (int axis = 0; out.directions && axis < 2; ++axis) {
-        out.directions[(first + r) * 2 + axis] = T(tile.direction[3 * r + axis]);
+        out.directions[(first + r) * 2 + axis] = tile.direction[3 * r + axis];
       }
     }
   }

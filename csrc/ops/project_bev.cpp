@@ -18,15 +18,7 @@ namespace {
 
 using torch::headeronly::MemoryFormat;
 
-template <typename S>
-const ProjectKernels<S>& project_kernels() {
-  if constexpr (std::is_same_v<S, float>)
-    return PRED_KERNELS(project_bev_f32);
-  else if constexpr (std::is_same_v<S, double>)
-    return PRED_KERNELS(project_bev_f64);
-  else
-    return PRED_KERNELS(project_bev_bf16);
-}
+PRED_KERNELS_BY_FACTOR(ProjectKernels, project_bev)
 
 template <typename S>
 struct Projection {
@@ -47,7 +39,7 @@ struct Projection {
     args.outputs = weight.size(0);
     args.rows = storage<S>(bev);
     cells = bev.size(0) * bev.size(2) * bev.size(3);
-    const ProjectKernels<S>& k = project_kernels<S>();
+    const ProjectKernels<S>& k = kernels<S>();
     const int64_t rows = backward ? args.outputs : args.inputs, columns = backward ? args.inputs : args.outputs;
     const int64_t size = k.packed_size(rows, columns);
     packed = allocate_array<char>(size * int64_t(sizeof(S)) + Arena::kAlignment);
@@ -70,7 +62,7 @@ Tensor project_bev(const Tensor& bev, const Tensor& weight) {
     const Projection<S> in(op, bev, weight, false);
     Tensor out = in.new_map(in.args.outputs);
     S* data = mutable_storage<S>(out);
-    const ProjectKernels<S>& k = project_kernels<S>();
+    const ProjectKernels<S>& k = kernels<S>();
     const Blocks tasks = product_tasks(in.cells);
     parallel(tasks.count(), 1, [&](int64_t first, int64_t last) {
       const auto scratch = allocate_array<char>(k.scratch_bytes(in.args));
@@ -90,11 +82,11 @@ std::tuple<Tensor, Tensor> project_bev_backward(const Tensor& grad_in, const Ten
     check_sizes(op, "grad", grad_in, {bev.size(0), weight.size(0), bev.size(2), bev.size(3)});
     const Tensor grad = torch::stable::contiguous(grad_in, MemoryFormat::ChannelsLast);
     in.args.grad = storage<S>(grad);
-    const ProjectKernels<S>& k = project_kernels<S>();
+    const ProjectKernels<S>& k = kernels<S>();
     Tensor out_bev = need_bev ? in.new_map(in.args.inputs) : torch::stable::new_empty(in.bev, {0});
     Tensor out_weight = torch::stable::new_empty(in.weight, {need_weight ? in.args.outputs : 0, in.args.inputs});
     const int64_t columns = k.columns(in.args.inputs), sums_size = in.args.outputs * columns;
-    const Blocks blocks = product_sums(in.cells);
+    const Blocks blocks = product_sums(in.cells, sums_size * int64_t(sizeof(T)));
     std::unique_ptr<T[]> sums;
     if (need_weight) sums = allocate_array<T>(blocks.count() * sums_size);
     parallel(blocks.count(), 1, [&](int64_t first, int64_t last) {

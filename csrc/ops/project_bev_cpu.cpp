@@ -3,13 +3,12 @@
 //
 // One iteration owns the cells of its range.
 #include "common/allocate.h"
+#include "common/tile.h"
 #include "math/product.h"
 #include "ops/project_bev.h"
 
 namespace pred::PRED_ISA {
 namespace {
-
-constexpr int64_t kTile = 96;  // cells
 
 // Copies of rows with whole panels of columns, the rest 0.
 template <typename S>
@@ -23,10 +22,10 @@ struct Tile {
     Arena arena(memory);
     in_stride = panel_columns<T>(a.inputs);
     out_stride = panel_columns<T>(a.outputs);
-    in = arena.take<S>(kTile * in_stride);
-    out = arena.take<S>(kTile * out_stride);
-    interleaved[0] = arena.take<S>(kPair<S> > 1 ? kTile * out_stride : 0);
-    interleaved[1] = arena.take<S>(kPair<S> > 1 ? kTile * in_stride : 0);
+    in = arena.take<S>(kRowTile * in_stride);
+    out = arena.take<S>(kRowTile * out_stride);
+    interleaved[0] = arena.take<S>(kPair<S> > 1 ? kRowTile * out_stride : 0);
+    interleaved[1] = arena.take<S>(kPair<S> > 1 ? kRowTile * in_stride : 0);
     end = arena.at;
   }
 };
@@ -69,8 +68,8 @@ static void multiply(const S* rows, int64_t row_stride, int64_t count, int64_t i
 template <typename S>
 static void forward(const ProjectArgs<S>& a, S* out, char* scratch, int64_t begin, int64_t end) {
   const Tile<S> tile(a, scratch);
-  for (int64_t first = begin; first < end; first += kTile) {
-    const int64_t count = end - first < kTile ? end - first : kTile;
+  for (int64_t first = begin; first < end; first += kRowTile) {
+    const int64_t count = end - first < kRowTile ? end - first : kRowTile;
     read_rows(a.rows + first * a.inputs, a.inputs, count, tile.in_stride, tile.in);
     multiply(tile.in, tile.in_stride, count, a.inputs, a.packed, a.outputs, tile.out_stride, tile.out);
     write_rows(tile.out, tile.out_stride, count, a.outputs, out + first * a.outputs);
@@ -81,8 +80,8 @@ template <typename S>
 static void backward(const ProjectArgs<S>& a, const ProjectGradients<S>& out, char* scratch, int64_t begin,
                      int64_t end) {
   const Tile<S> tile(a, scratch);
-  for (int64_t first = begin; first < end; first += kTile) {
-    const int64_t count = end - first < kTile ? end - first : kTile;
+  for (int64_t first = begin; first < end; first += kRowTile) {
+    const int64_t count = end - first < kRowTile ? end - first : kRowTile;
     // Most cells of a map are touched by no ray: their gradient is 0, and costs nothing more.
     const bool any = read_rows(a.grad + first * a.outputs, a.outputs, count, tile.out_stride, tile.out);
     if (any && out.weight) {

@@ -98,8 +98,7 @@ class FieldDecoder(nn.Module):
     ) -> DecodedField:
         """Decodes points given in metres in the map's (LiDAR) frame.
 
-        Differentiable in the map and the parameters, the gradient output included (once: for the
-        Eikonal term); in the points as far as `sdf` and `semantics` go.
+        Differentiable once in the map, the points and the parameters, the gradient output included.
 
         Args:
             bev: BEV map, row = y, column = x, spanning the range box.

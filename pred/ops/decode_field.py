@@ -11,7 +11,6 @@ from typing import Any, Literal, NamedTuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from pred import _native
 from pred.ops._check import (
@@ -30,9 +29,10 @@ from pred.ops._check import (
     check_tensors,
     widen,
 )
-from pred.ops.sample_bev import sample_bev_reference
+from pred.ops.sample_bev import sample_bev_reference, sample_bev_with_grad_reference
 
 OP = "decode_field"
+MAX_HIDDEN = 4096
 MAX_LAYERS = 16
 MAX_FREQUENCIES = 16
 
@@ -81,7 +81,8 @@ def project_bev(
 
     Returns:
         ``[B, hidden, H, W]`` in the weight's dtype, with ``"bf16"`` in bfloat16, and in channels-last memory.
-        Differentiable once; deterministic for any number of threads.
+        Differentiable once; deterministic for any number of threads. With ``"bf16"``, torch adds the gradients of
+        several uses in bfloat16.
 
     Raises:
         ValueError: shapes, devices. TypeError: dtypes.
@@ -204,8 +205,7 @@ def decode_field_reference(
 ) -> DecodedField:
     """Plain PyTorch form of :func:`decode_field`; ``precision`` and ``recompute`` change nothing here.
 
-    Differentiable once, the gradient output included, as the compiled form; in the points as far as ``sdf`` and
-    ``semantics`` go any number of times.
+    Differentiable any number of times, the compiled form once.
     """
     check_flags(OP, with_gradient=with_gradient, projected=projected, recompute=recompute)
     points, weights, biases, settings = _arguments(
@@ -228,6 +228,9 @@ def _arguments(
     projected: bool,
 ) -> tuple[Tensor, list[Tensor], list[Tensor], _Settings]:
     """Checked; half-precision points are widened, and parameters in a half-precision region."""
+    for name, tensors in (("weights", weights), ("biases", biases)):
+        if not isinstance(tensors, Sequence):
+            raise TypeError(f"{OP}: {name} must be a list of tensors, got {type(tensors).__name__}")
     layers = {f"weights[{i}]": weight for i, weight in enumerate(weights)}
     layers |= {f"biases[{i}]": bias for i, bias in enumerate(biases)}
     check_tensors(OP, bev=bev, points=points, **layers)
@@ -249,6 +252,10 @@ def _arguments(
     encoding = 3 + 6 * frequencies
     check_shape(OP, "weights[0]", weights[0], ("hidden", "C + 3 + 6 F"))
     hidden, inputs = weights[0].shape
+    if not 1 <= hidden <= MAX_HIDDEN:
+        raise ValueError(f"{OP}: weights[0] must have 1 to {MAX_HIDDEN} rows, got {hidden}")
+    if bev.shape[1] == 0:
+        raise ValueError(f"{OP}: bev must have at least one channel, got {list(bev.shape)}")
     if projected:
         check_shape(OP, "bev", bev, ("B", hidden, "H", "W"), " with projected=True")
         if inputs < encoding:
@@ -308,12 +315,7 @@ def _reference(
     grid_map = bev if projected else _project_reference(bev, weights[0][:, : bev.shape[1]])
 
     if with_gradient:
-        # Sampling needs its graph for d feature / d point even where gradients are off.
-        with torch.enable_grad():
-            grid = position[..., :2]
-            if not grid.requires_grad:
-                grid = grid.detach().requires_grad_()
-            sampled = sample_bev_reference(grid_map, grid)
+        sampled, map_slopes = sample_bev_with_grad_reference(grid_map, position[..., :2])
     else:
         sampled = sample_bev_reference(grid_map, position[..., :2])
 
@@ -336,7 +338,7 @@ def _reference(
         for weight, slope in zip(weights[-2:0:-1], slopes[-2::-1], strict=True):
             by_activation = (by_activation @ weight) * slope
         by_position = _encoding_gradient(by_activation @ columns, encoding, settings.frequencies)
-        (by_grid,) = torch.autograd.grad(sampled, grid, by_activation, create_graph=torch.is_grad_enabled())
+        by_grid = (map_slopes * by_activation[..., None, :]).sum(-1)
         gradient = (by_position + F.pad(by_grid, (0, 1))) / half_extent
     semantics = output[..., 1:] if output.shape[-1] > 1 else None
     return DecodedField(output[..., 0] * settings.sdf_scale, semantics, gradient)
@@ -362,7 +364,8 @@ def _softplus(activation: Tensor, beta: float) -> Tensor:
 
 
 class _SoftplusAndSlope(torch.autograd.Function):
-    """Softplus and its derivative, sigmoid(beta z), with one cheap backward for both."""
+    """Softplus and its derivative, sigmoid(beta z), with one cheap backward for both; differentiable any number of
+    times."""
 
     @staticmethod
     def forward(ctx: Any, activation: Tensor, beta: float) -> tuple[Tensor, Tensor]:
@@ -372,12 +375,10 @@ class _SoftplusAndSlope(torch.autograd.Function):
         return _softplus(activation, beta), slope
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad_value: Tensor, grad_slope: Tensor) -> tuple[Tensor, None]:
         (slope,) = ctx.saved_tensors
         # d slope / d activation = beta slope (1 - slope)
-        bend = torch.addcmul(grad_slope, grad_slope, slope, value=-1).mul_(ctx.beta)
-        return bend.add_(grad_value).mul_(slope), None
+        return slope * (grad_value + ctx.beta * (1 - slope) * grad_slope), None
 
 
 # --- Compiled ops ----------------------------------------------------------------------------------
@@ -396,7 +397,8 @@ def _project_save(ctx: Any, inputs: Any, output: Any) -> None:
 
 def _project_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     need = ctx.needs_input_grad
-    found = torch.ops.pred.project_bev_backward(grad, *ctx.saved_tensors, need[0], need[1])
+    with torch.autocast(grad.device.type, enabled=False):
+        found = torch.ops.pred.project_bev_backward(grad, *ctx.saved_tensors, need[0], need[1])
     return tuple(value if wanted else None for value, wanted in zip(found, need, strict=True))
 
 
@@ -451,10 +453,12 @@ def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
     if sdf is None and semantics is None and gradient is None:
         return (None, None, None, *none)
     need = ctx.needs_input_grad
-    found = torch.ops.pred.decode_field_backward(
-        sdf, semantics, gradient if ctx.with_gradient else None, *ctx.saved_tensors, *ctx.settings,
-        need[0], need[1], need[2],
-    )  # fmt: skip
+    projected, points, parameters, *kept = ctx.saved_tensors
+    with torch.autocast(points.device.type, enabled=False):  # which would widen the map and what was kept
+        found = torch.ops.pred.decode_field_backward(
+            sdf, semantics, gradient if ctx.with_gradient else None, projected, points, parameters, *kept,
+            *ctx.settings, need[0], need[1], need[2],
+        )  # fmt: skip
     return (*(value if wanted else None for value, wanted in zip(found, need, strict=False)), *none)
 
 

@@ -222,6 +222,57 @@ def test_gradcheck_of_all_outputs_together(native: None) -> None:
     assert torch.autograd.gradcheck(call, case.leaves)
 
 
+@pytest.mark.parametrize("recompute", [False, True])
+@pytest.mark.parametrize("outputs_used", [("sdf",), ("semantics",), ("gradient",), ("sdf", "gradient")], ids=str)
+@pytest.mark.parametrize("wanted", [(0,), (1,), (2, 6), (0, 1, 5, 9)], ids=str)
+def test_parts_of_the_derivative(
+    wanted: tuple[int, ...], outputs_used: tuple[str, ...], recompute: bool, native: None
+) -> None:
+    """Any of the leaves, from any of the outputs."""
+    case = make()
+
+    def gradients(function: Any, **options: Any) -> dict[str, Tensor]:
+        fresh = case.to(torch.float64)
+        for leaf in fresh.leaves:
+            leaf.requires_grad_(False)
+        leaves = [fresh.leaves[position].requires_grad_() for position in wanted]
+        out = fresh.call(function, with_gradient=True, **options)
+        loss = sum((getattr(out, name) ** 2).sum() for name in outputs_used)
+        found = torch.autograd.grad(loss, leaves, allow_unused=True, materialize_grads=True)
+        return {str(position): grad for position, grad in zip(wanted, found, strict=True)}
+
+    assert_all_close(gradients(decode_field, recompute=recompute), gradients(reference.decode_field), 1e-11)
+
+
+def test_autocast_around_the_backward_pass_changes_no_bit(native: None) -> None:
+    case = make().to(torch.float32)
+    plain = results(case, with_gradient=True, precision="bf16")
+    with torch.autocast("cpu", torch.bfloat16):
+        inside = results(case, with_gradient=True, precision="bf16")
+    for name, value in plain.items():
+        assert torch.equal(value, inside[name]), name
+
+
+def test_inference_mode(backend: str) -> None:
+    case = make()
+    with torch.inference_mode():
+        found = outputs(case.call(with_gradient=True))
+    for value, expected in zip(found, outputs(case.call(with_gradient=True)), strict=True):
+        assert_close(value, expected.detach(), 1e-13)
+
+
+def test_reference_has_any_derivative() -> None:
+    case = make(hidden=6, layers=3, classes=1, channels=2, frequencies=1, beta=2.0, count=3)
+    settings = case.settings | {"with_gradient": True}
+
+    def call(points: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
+        weights = [case.weights[0].detach(), weight, case.weights[2].detach()]
+        biases = [bias.detach() for bias in case.biases]
+        return tuple(outputs(reference.decode_field(case.bev.detach(), points, weights, biases, RANGE, **settings)))
+
+    assert torch.autograd.gradgradcheck(call, (case.points, case.weights[1]))
+
+
 def test_projected_map_gives_the_same(backend: str) -> None:
     case = make()
     direct = outputs(case.call(with_gradient=True))
@@ -266,15 +317,14 @@ def test_saturated_softplus(scale: float, level: str) -> None:
         case.weights[-2].zero_()
         case.biases[-2].fill_(scale / case.settings["softplus_beta"])
     expected = results(case, reference.decode_field, with_gradient=True)
-    actual = results(case.to(torch.float32), with_gradient=True)
-    for name, value in actual.items():
-        assert value.isfinite().all(), name
-    if scale > 0:
-        assert_all_close(actual, expected, FP32)
-        assert_all_close(results(case.to(torch.float32), with_gradient=True, precision="bf16"), expected, BF16)
-    else:
-        assert_close(actual["sdf"].double(), expected["sdf"], FP32)
-        assert float(expected["gradient"].abs().max()) < 1e-40 and (actual["gradient"] == 0).all()
+    for precision, tolerance in (("fp32", FP32), ("bf16", BF16)):
+        actual = results(case.to(torch.float32), with_gradient=True, precision=precision)
+        for name, value in actual.items():
+            assert value.isfinite().all(), name
+            if scale > 0 or float(expected[name].norm()) > 1e-30:
+                assert_all_close({name: value}, {name: expected[name]}, tolerance)
+        if scale < 0:
+            assert float(expected["gradient"].abs().max()) < 1e-40 and (actual["gradient"] == 0).all()
 
 
 def test_at_cell_edges_the_gradient_is_one_sided(backend: str) -> None:
@@ -346,6 +396,12 @@ def test_errors(backend: str) -> None:
         call(precision="fp16")
     with pytest.raises(TypeError, match="decode_field: precision must be 'fp32' where points is torch.float64"):
         call(precision="bf16")
+    with pytest.raises(ValueError, match=r"decode_field: bev must have at least one channel, got \[2, 0, 4, 8\]"):
+        case._replace(bev=case.bev[:, :0]).call()
+    with pytest.raises(ValueError, match=r"decode_field: weights\[0\] must have 1 to 4096 rows, got 0"):
+        case._replace(weights=[case.weights[0][:0], *case.weights[1:]]).call()
+    with pytest.raises(TypeError, match="decode_field: biases must be a list of tensors, got NoneType"):
+        case._replace(biases=None).call()  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="decode_field: frequencies must be at most 16, got 17"):
         call(frequencies=17)
 
