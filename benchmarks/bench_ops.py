@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from benchmarks import cases, ops_points, ops_rays, ops_sampling
+from benchmarks import cases, ops_field, ops_points, ops_rays, ops_sampling
 from benchmarks.case import SECOND_ALONE, Case, Phase, Variant
 from benchmarks.cases import Sizes
 from benchmarks.measure import Run, time_interleaved
@@ -23,7 +23,12 @@ from benchmarks.phases import prepare, prepare_compiled
 from benchmarks.report import NOT_INSTALLED, Row
 from pred._native import native_status
 
-FAMILIES = {"sampling": ops_sampling.CASES, "rays": ops_rays.CASES, "points": ops_points.CASES}
+FAMILIES = {
+    "sampling": ops_sampling.CASES,
+    "field": ops_field.CASES,
+    "rays": ops_rays.CASES,
+    "points": ops_points.CASES,
+}
 CASES = {op: make for family in FAMILIES.values() for op, make in family.items()}
 
 
@@ -107,6 +112,9 @@ def check_phase(
             items=case.items,
             traffic=phase.traffic,
             traffic_bytes=phase.traffic_bytes,
+            work=phase.work,
+            flop=phase.flop,
+            flop_dtype=phase.flop_dtype,
             targets=phase.targets,
         )
         if kind == "ours" and (reason := missing_kernel(case.op)):

@@ -7,8 +7,9 @@ instead; the library itself knows nothing of it. Of calls with equal shapes and 
 the op got it. A hook on its outputs notes which of them a gradient reaches.
 
 The file is made by ``torch.save`` and loads with ``weights_only=True``: ``{"schema", "source", "versions", "calls"}``;
-each call has ``op``, ``arguments`` (by name; tensors and plain values), ``differentiable`` (names of the tensors that
-require a gradient), ``used`` (positions of the outputs that get one) and ``times`` (calls alike).
+each call has ``op``, ``arguments`` (by name, ``name[0]`` ... where they stand in a list; tensors and plain values),
+``differentiable`` (names of the tensors that require a gradient), ``used`` (positions of the outputs that get one) and
+``times`` (calls alike).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from torch import Tensor
 import pred
 from benchmarks.bench_ops import CASES
 from benchmarks.bench_step import contender
-from benchmarks.case import BACKWARD, FORWARD, Case, Phase
+from benchmarks.case import BACKWARD, FORWARD, Case, Phase, gather, spread
 from benchmarks.cases import TINY, Sizes
 from pred import ops
 from pred.ops import reference
@@ -123,7 +124,7 @@ def _noting(function: Callable[..., Any], calls: dict[str, Call]) -> Callable[..
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        bound = signature.bind(*args, **kwargs).arguments
+        bound = spread(signature.bind(*args, **kwargs).arguments)
         key = f"{function.__name__} {[(name, _fact(value)) for name, value in bound.items()]}"
         if key in calls:
             calls[key].times += 1
@@ -225,7 +226,7 @@ def _case(call: Call) -> Case:
     inputs = tuple(call.arguments[name] for name in names)
 
     def caller(function: Callable[..., Any]) -> Callable[..., tuple[Tensor, ...]]:
-        return lambda *tensors: tensors_of(function(**call.arguments | dict(zip(names, tensors, strict=True))))
+        return lambda *tensors: tensors_of(function(**gather(call.arguments | dict(zip(names, tensors, strict=True)))))
 
     plain = caller(getattr(reference, call.op))
     leaves, used, outputs = _derivative(plain, inputs, [names.index(name) for name in call.differentiable], call.used)

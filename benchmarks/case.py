@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from torch import Tensor
 
@@ -29,6 +30,11 @@ class Phase:
     """Formula of the bytes, in the letters of `pred.ops`."""
     traffic_bytes: int
     targets: tuple[Target, ...] = ()
+    work: str = ""
+    """Formula of the useful floating-point operations, where they and not the bytes are the limit."""
+    flop: int = 0
+    flop_dtype: str = "float32"
+    """Of the products' operands."""
 
 
 @dataclass(frozen=True)
@@ -69,3 +75,25 @@ class Case:
     """Share of elements that may miss the tolerance, with the reason beside it."""
     peers: Mapping[str, Callable[[], Variant]] = field(default_factory=dict)
     """Other libraries, by name. The call imports the library, so that a missing one is an ImportError of its own."""
+
+
+def spread(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Tensors that stand in a list by names of their own: ``weights[0]``, ``weights[1]`` ..."""
+    found: dict[str, Any] = {}
+    for name, value in arguments.items():
+        if isinstance(value, list | tuple) and any(isinstance(item, Tensor) for item in value):
+            found |= {f"{name}[{position}]": item for position, item in enumerate(value)}
+        else:
+            found[name] = value
+    return found
+
+
+def gather(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """The lists that `spread` took apart."""
+    found: dict[str, Any] = {}
+    for name, value in arguments.items():
+        if name.endswith("]"):
+            found.setdefault(name.partition("[")[0], []).append(value)
+        else:
+            found[name] = value
+    return found

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from benchmarks.bench_ops import expected_results, make_cases, run_phase
-from benchmarks.bench_step import run_step
+from benchmarks.bench_step import STEP, run_step
 from benchmarks.capture import CaptureError, capture_steps, captured_cases
 from benchmarks.case import Case
 from benchmarks.cases import SIZES
@@ -39,7 +39,7 @@ def main() -> None:
     os.environ["PRED_BACKEND"] = "native" if native_status()["available"] else "reference"
     try:
         if options.trace:
-            step = SIZES[options.sizes] if "step" in options.ops and not options.replay else None
+            step = SIZES[options.sizes] if STEP in options.ops and not options.replay else None
             write_trace(options.trace, chosen_cases(options), step, max(options.threads), chosen_kinds(options))
             print(f"written: {options.trace}; open it in chrome://tracing or ui.perfetto.dev")
         elif options.capture:
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> Report:
     report = Report(options)
     cases = chosen_cases(options)
     kinds = chosen_kinds(options)
-    with_step = "step" in options.ops and not options.replay
+    with_step = STEP in options.ops and not options.replay
     plain_kinds = [kind for kind in options.contenders if kind in ("ours", "eager")]
     with_default = bool(cases and plain_kinds) and not (options.default_allocator or options.quick or options.replay)
     phases = sum(len(phases_of(case)) for case in cases) * len(options.threads)
@@ -77,7 +77,7 @@ def run(options: argparse.Namespace) -> Report:
 
         def on_step(what: str) -> None:
             progress.show(what)
-            progress.advance(STEP_UNITS // 8)  # four contenders, their timing, memory of three
+            progress.advance(STEP_UNITS // 14)  # seven contenders, their timing, memory of six
 
         report.rows += run_step(options.sizes, max(options.threads), options.contenders, options.min_time, on_step)
         progress.done = done + STEP_UNITS
@@ -92,7 +92,7 @@ def run(options: argparse.Namespace) -> Report:
 
 def chosen_cases(options: argparse.Namespace) -> list[Case]:
     """Of the ops asked for; those of a capture where there is one."""
-    ops = [op for op in options.ops if op != "step"]
+    ops = [op for op in options.ops if op != STEP]
     if options.replay:
         return captured_cases(options.replay, ops)
     return [case for op in ops for case in make_cases(op, SIZES[options.sizes])]
@@ -139,7 +139,7 @@ def _run_with_default_allocator(options: argparse.Namespace, kinds: list[str]) -
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "result.json"
         command = [sys.executable, "-m", "benchmarks", "--default-allocator", "--quick", "--quiet", "--out", str(out)]
-        command += ["--ops", ",".join(op for op in options.ops if op != "step"), "--sizes", options.sizes]
+        command += ["--ops", ",".join(op for op in options.ops if op != STEP), "--sizes", options.sizes]
         command += ["--threads", ",".join(map(str, options.threads)), "--contenders", ",".join(kinds)]
         command += ["--min-time", str(options.min_time)]
         done = subprocess.run(command)

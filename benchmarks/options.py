@@ -13,12 +13,13 @@ from typing import Any
 import torch
 
 from benchmarks.bench_ops import CASES
+from benchmarks.bench_step import STEP
 from benchmarks.case import KINDS
 from benchmarks.cases import SIZES
 from benchmarks.compare import RecordError, load_record
 from benchmarks.measure import ROUNDS
 
-OPS = (*CASES, "step")
+OPS = (*CASES, STEP)
 QUICK = 5
 
 EPILOG = """
@@ -27,7 +28,7 @@ contenders
   eager     good plain PyTorch; where several ways are timed, ratios are against the fastest
   compiled  torch.compile of an eager way; "refused" says why there is none
   peers     other libraries, where installed: spconv, mmcv, nerfacc, torch-scatter
-  reference (step, --replay) PyTorch references of pred.ops
+  reference (rendering_step, --replay) PyTorch references of pred.ops
 
 phases
   forward, backward (its graph is built outside the time), forward+backward, second order (forward, derivative in the
@@ -59,7 +60,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         allow_abbrev=False,  # `__main__` looks for --default-allocator before this parser does
     )
     what = parser.add_argument_group("what is run")
-    what.add_argument("--ops", type=_list_of(OPS), default=list(OPS), help=f"some of {','.join(OPS)}")
+    what.add_argument(
+        "--ops", type=_list_of(OPS), nargs="+", default=[list(OPS)], help=f"some of {', '.join(OPS)}; or with commas"
+    )
     what.add_argument("--sizes", choices=tuple(SIZES), default="real", help="real LiDAR sizes, or tiny ones")
     what.add_argument(
         "--threads",
@@ -134,6 +137,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         options.earlier = None if options.compare is None else load_record(options.compare)
     except RecordError as error:
         parser.error(f"--compare {error}")
+    options.ops = [op for names in options.ops for op in names]
     options.out = options.out or Path(time.strftime("benchmarks/results/%Y%m%dT%H%M%SZ.json", time.gmtime()))
     options.threads = options.threads or sorted({1, torch.get_num_threads()})
     options.rounds = 3 if options.quick else ROUNDS

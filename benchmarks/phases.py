@@ -32,8 +32,13 @@ def phases_of(case: Case) -> tuple[Phase, ...]:
     for phase in case.phases:
         if phase.name == BACKWARD and FORWARD in declared:
             forward = declared[FORWARD]
-            traffic = f"{phase.traffic} - {forward.traffic}"
-            phases.append(Phase(BACKWARD_ALONE, traffic, phase.traffic_bytes - forward.traffic_bytes))
+            traffic, work = (
+                f"{total} - {part}" if part else ""
+                for total, part in ((phase.traffic, forward.traffic), (phase.work, forward.work))
+            )
+            left = phase.traffic_bytes - forward.traffic_bytes
+            flop = phase.flop - forward.flop
+            phases.append(Phase(BACKWARD_ALONE, traffic, left, work=work, flop=flop, flop_dtype=phase.flop_dtype))
         phases.append(phase)
         if phase.name == SECOND:
             phases.append(Phase(SECOND_ALONE, "", 0))  # its share of the bytes is not declared

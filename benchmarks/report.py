@@ -45,6 +45,8 @@ class Row:
     work: str = ""
     """Formula of the useful arithmetic, where matrix products are the limit."""
     flop: int = 0
+    flop_dtype: str = "float32"
+    """Of the products' operands."""
     status: str = "ok"
     """``ok``, or why there is no time: ``refused: ...``, ``missing: ...``, ``wrong: ...``, ``not installed``."""
     error: float | None = None
@@ -73,7 +75,10 @@ class Row:
             rates["copy_share"] = rates["bytes_per_s"] / ceiling.copy_bytes_per_s
         if self.flop:
             rates["flop_per_s"] = self.flop / seconds
-            rates["matrix_share"] = rates["flop_per_s"] / ceiling.matrix_flop_per_s
+            half = self.flop_dtype == "bfloat16"
+            rates["matrix_share"] = rates["flop_per_s"] / (
+                ceiling.bfloat16_flop_per_s if half else ceiling.matrix_flop_per_s
+            )
         return rates
 
 
@@ -261,10 +266,15 @@ def comparison_table(
 def ceiling_table(ceilings: Mapping[int, Ceilings]) -> Table:
     """The measured ceilings."""
     lines = [
-        [str(threads), f"{item.copy_bytes_per_s / 1e9:.1f} GB/s", f"{item.matrix_flop_per_s / 1e9:.1f} GFLOP/s"]
+        [
+            str(threads),
+            f"{item.copy_bytes_per_s / 1e9:.1f} GB/s",
+            f"{item.matrix_flop_per_s / 1e9:.1f} GFLOP/s",
+            f"{item.bfloat16_flop_per_s / 1e9:.1f} GFLOP/s",
+        ]
         for threads, item in ceilings.items()
     ]
-    return Table(("threads", "copy bandwidth", "matrix rate"), lines, right=(0, 1, 2))
+    return Table(("threads", "copy bandwidth", "matrix rate", "in bfloat16"), lines, right=(0, 1, 2, 3))
 
 
 def key_of(comparison: Mapping[str, Any]) -> tuple[str, str, int]:

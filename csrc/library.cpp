@@ -44,6 +44,20 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "sample_volume_with_grad_backward(Tensor? grad_values, Tensor? grad_grads, Tensor volume, Tensor grid, "
       "bool border, bool align_corners, bool need_volume, bool need_grid) -> (Tensor, Tensor)");
 
+  m.def("project_bev(Tensor bev, Tensor weight) -> Tensor");
+  m.def(
+      "project_bev_backward(Tensor grad, Tensor bev, Tensor weight, bool need_bev, bool need_weight) -> "
+      "(Tensor, Tensor)");
+  m.def(
+      "decode_field(Tensor projected, Tensor points, Tensor parameters, SymInt[] widths, float[] point_range, "
+      "SymInt octaves, float beta, float sdf_scale, bool with_gradient, bool keep) -> "
+      "(Tensor sdf, Tensor semantics, Tensor gradient, Tensor activation, Tensor chain)");
+  m.def(
+      "decode_field_backward(Tensor? grad_sdf, Tensor? grad_semantics, Tensor? grad_gradient, Tensor projected, "
+      "Tensor points, Tensor parameters, Tensor activation, Tensor chain, SymInt[] widths, "
+      "float[] point_range, SymInt octaves, float beta, float sdf_scale, bool need_projected, bool need_points, "
+      "bool need_parameters) -> (Tensor, Tensor, Tensor)");
+
   m.def("segment_reduce(Tensor features, Tensor index, SymInt num_segments, str reduce) -> (Tensor, Tensor)");
   m.def("segment_reduce_backward(Tensor grad, Tensor index, Tensor saved, str reduce) -> Tensor");
 

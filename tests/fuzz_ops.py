@@ -276,7 +276,11 @@ def is_ours(error: Exception) -> bool:
 
 
 def require_form(op: str, who: str, error: Exception | None) -> None:
-    if error is not None and is_ours(error) and not re.match(rf"{op}: \w+ must .*, got ", str(error), re.DOTALL):
+    if (
+        error is not None
+        and is_ours(error)
+        and not re.match(rf"{op}: \w+(\[\d+\])? must .*, got ", str(error), re.DOTALL)
+    ):
         raise FindingError(f"{who} does not say '{op}: argument must <rule>, got <fact>': {error!r}")
 
 

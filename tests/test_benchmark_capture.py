@@ -61,11 +61,11 @@ def test_every_case_has_its_range_in_the_trace(tmp_path: Path, monkeypatch: pyte
 
 
 def test_recording_notes_calls_and_leaves_nothing_behind() -> None:
-    places = [(ops, "sample_bev"), (field, "sample_bev"), (renderer, "composite_rays"), (renderer, "resample_rays")]
+    places = [(ops, "sample_bev"), (field, "decode_field"), (renderer, "composite_rays"), (renderer, "resample_rays")]
     before = [getattr(module, name) for module, name in places]
     bev, grid = torch.randn(1, 2, 4, 4).requires_grad_(), torch.rand(1, 3, 2)
     with pytest.raises(RuntimeError, match="stop"), recording():
-        assert field.sample_bev is not before[1]
+        assert field.decode_field is not before[1]
         raise RuntimeError("stop")
     with recording() as calls:
         first = ops.sample_bev(bev, grid)
@@ -98,11 +98,11 @@ def test_capture_of_the_rendering_step(tmp_path: Path) -> None:
     path = tmp_path / "ops.pt"
     summary = capture_steps(path, "step", TINY)
     assert "composite_rays(sdf float32[3, 14], " in summary and f"written: {path}" in summary
-    check_replay(path, {"sample_bev", "composite_rays", "resample_rays"})
+    check_replay(path, {"decode_field", "composite_rays", "resample_rays"})
     phases = {case.op: set() for case in captured_cases(path, list(CASES))}  # type: dict[str, set[str]]
     for case in captured_cases(path, list(CASES)):
         phases[case.op] |= {phase.name for phase in phases_of(case)}
-    assert phases["sample_bev"] == phases["composite_rays"] == {FORWARD, BACKWARD_ALONE, BACKWARD}
+    assert phases["decode_field"] == phases["composite_rays"] == {FORWARD, BACKWARD_ALONE, BACKWARD}
     assert phases["resample_rays"] == {FORWARD}
     assert {case.op for case in captured_cases(path, ["resample_rays"])} == {"resample_rays"}
 
@@ -114,7 +114,7 @@ def test_capture_of_pretraining(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     capture_steps(path, str(config), TINY)
     assert not (tmp_path / "unused").exists()
     assert len(load(path)) > 5
-    check_replay(path, {"voxelize", "segment_reduce", "sample_bev", "composite_rays", "resample_rays"})
+    check_replay(path, {"voxelize", "segment_reduce", "decode_field", "composite_rays", "resample_rays"})
 
 
 def test_capture_of_a_wrong_configuration(tmp_path: Path) -> None:

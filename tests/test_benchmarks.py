@@ -43,7 +43,7 @@ PHASES = {
     "farthest_point_sample": {FORWARD},
     "knn": {FORWARD},
     "ball_query": {FORWARD},
-    "step": {BACKWARD},
+    "rendering_step": {BACKWARD},
 }
 FOLLOWING = {BACKWARD: BACKWARD_ALONE, SECOND: SECOND_ALONE}
 
@@ -65,7 +65,9 @@ def check_rows(rows: list[dict[str, Any]]) -> None:
         timing = row["timing"]
         assert 0 < timing["q25_s"] <= timing["median_s"] <= timing["q75_s"], name
         assert timing["samples"] >= len(timing["round_medians_s"]) == 3, name
-        limit = 1e-2 if "bfloat16" in row["case"] else 1e-3  # neighbouring bfloat16 numbers are 4e-3 to 8e-3 apart
+        # Neighbouring bfloat16 numbers are 4e-3 to 8e-3 apart; the decoder's layers add what they round.
+        half = 0.25 if row["op"] == "rendering_step" else 5e-2  # see TOLERANCES there
+        limit = half if ", bf16" in row["case"] else 1e-2 if "bfloat16" in row["case"] else 1e-3
         assert row["error"] is not None and row["error"] < limit, name
         assert row["items"] > 0 and row["rates"]["items_per_s"] == pytest.approx(row["items"] / timing["median_s"])
         assert row["peak_memory_bytes"] is None or row["peak_memory_bytes"] >= 0, name
@@ -94,7 +96,7 @@ def test_every_case_runs(tmp_path: Path) -> None:
 
     check_rows(result["rows"])
     for op, phases in PHASES.items():
-        if op != "step":
+        if op != "rendering_step":
             phases = phases | {FOLLOWING[phase] for phase in phases & set(FOLLOWING)}
         assert {row["phase"] for row in result["rows"] if row["op"] == op} == phases
     for row in result["rows"]:
@@ -110,7 +112,7 @@ def test_every_case_runs(tmp_path: Path) -> None:
             assert picture.width >= 1000 and picture.height > 500
     else:
         assert "pip install 'pred-lidar[bench]'" in done.stdout
-    step = {row["contender"]: row for row in result["rows"] if row["op"] == "step"}
+    step = {row["contender"]: row for row in result["rows"] if row["op"] == "rendering_step"}
     assert step["eager"]["peak_memory_bytes"] > 0 and step["reference"]["peak_memory_bytes"] > 0
 
 
@@ -219,10 +221,10 @@ def test_traffic_formulas() -> None:
 def test_useful_flop() -> None:
     trunk, head = 39 * 256 + 2 * 256**2, 256  # 141 056 multiply-adds, and 256 per output row
     coarse = 2 * 96 * (trunk + head)
-    depth = 224 * 6 * (trunk + head)
+    depth = 224 * (6 * trunk + 3 * head)
     semantic = 224 * 3 * (trunk + 20 * head)
-    assert coarse + depth + semantic == 315_285_504
-    assert bench_step.useful_flop(REAL) == 2 * (512 * 315_285_504 + 3 * 32_400 * 128 * 256)
+    assert coarse + depth + semantic == 315_113_472
+    assert bench_step.useful_flop(REAL) == 2 * (512 * 315_113_472 + 3 * 32_400 * 128 * 256)
 
 
 def timing(*round_medians_s: float) -> Timing:
@@ -254,7 +256,7 @@ def row(contender: str, kind: str, times: Timing | None, memory: int | None = No
 
 
 def test_comparison_is_with_the_fastest_eager_and_against_the_targets() -> None:
-    ceilings = {2: Ceilings(2, copy_bytes_per_s=1e6, matrix_flop_per_s=1e9)}
+    ceilings = {2: Ceilings(2, copy_bytes_per_s=1e6, matrix_flop_per_s=1e9, bfloat16_flop_per_s=2e9)}
     rows = [
         row("ours", "ours", timing(0.01, 0.02, 0.03), memory=100_000_000),
         row("eager slow", "eager", timing(0.1, 0.1, 0.1)),
@@ -288,7 +290,10 @@ def test_scaling_is_ours_against_fewer_threads() -> None:
     alone = replace(row("ours", "ours", timing(0.038, 0.038, 0.038)), threads=1)
     eager = replace(row("eager", "eager", timing(0.1, 0.1, 0.1)), threads=1)
     rows = [alone, eager, row("ours", "ours", timing(0.02, 0.02, 0.02)), row("eager", "eager", timing(0.1, 0.1, 0.1))]
-    ceilings = {threads: Ceilings(threads, copy_bytes_per_s=1e6, matrix_flop_per_s=1e9) for threads in (1, 2)}
+    ceilings = {
+        threads: Ceilings(threads, copy_bytes_per_s=1e6, matrix_flop_per_s=1e9, bfloat16_flop_per_s=2e9)
+        for threads in (1, 2)
+    }
     first, second = compare(rows, ceilings)
     assert "scaling" not in first and second["scaling"] == {"threads": 1, "ratio": pytest.approx(1.9)}
     assert "1.90x of 1" in comparison_table([first, second]).text()

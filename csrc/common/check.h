@@ -114,6 +114,27 @@ T read_sharpness(const char* op, const Tensor& inv_s, ScalarType dtype) {
     }                                                                                                           \
   }()
 
+// Calls the body with S: float, double or BFloat16.
+#define PRED_DISPATCH_FIELD(op, dtype, ...)                                                            \
+  [&] {                                                                                                \
+    switch (dtype) {                                                                                   \
+      case ::pred::ScalarType::BFloat16: {                                                             \
+        using S = ::pred::BFloat16;                                                                    \
+        return __VA_ARGS__();                                                                          \
+      }                                                                                                \
+      case ::pred::ScalarType::Float: {                                                                \
+        using S = float;                                                                               \
+        return __VA_ARGS__();                                                                          \
+      }                                                                                                \
+      case ::pred::ScalarType::Double: {                                                               \
+        using S = double;                                                                              \
+        return __VA_ARGS__();                                                                          \
+      }                                                                                                \
+      default:                                                                                         \
+        throw std::invalid_argument(std::string(op) + ": dtype must be float32, float64 or bfloat16"); \
+    }                                                                                                  \
+  }()
+
 template <typename S>
 const S* storage(const Tensor& tensor) {
   return static_cast<const S*>(tensor.const_data_ptr());

@@ -70,6 +70,18 @@ const Table& pick(Isa isa, const Table& baseline, const Table& avx2, const Table
       return PRED_KERNELS(name##_f64);      \
   }
 
+// The same for tables by the type of products' operands: name_f32, name_f64 or name_bf16.
+#define PRED_KERNELS_BY_FACTOR(Table, name)       \
+  template <typename S>                           \
+  const Table<S>& kernels() {                     \
+    if constexpr (std::is_same_v<S, float>)       \
+      return PRED_KERNELS(name##_f32);            \
+    else if constexpr (std::is_same_v<S, double>) \
+      return PRED_KERNELS(name##_f64);            \
+    else                                          \
+      return PRED_KERNELS(name##_bf16);           \
+  }
+
 // The same for tables by storage type (math/half.h): name_f32, name_f64, name_bf16 or name_f16.
 #define PRED_KERNELS_BY_STORAGE(Table, name)        \
   template <typename S>                             \

@@ -1,25 +1,6 @@
 // Copyright 2026 The PRED authors
 // SPDX-License-Identifier: Apache-2.0
-#include "ops/sample_grid_binding.h"
-
-namespace pred {
-namespace {
-
-PRED_KERNELS_BY_STORAGE(SampleBevKernels, sample_bev)
-
-struct Bev {
-  static constexpr int kAxes = 2;
-  static constexpr const char* kName = "sample_bev";
-  static constexpr const char* kMap = "bev";
-  template <typename S>
-  static const SampleBevKernels<S>& table() {
-    return kernels<S>();
-  }
-};
-using SampleBev = SampleGrid<Bev>;
-
-}  // namespace
-}  // namespace pred
+#include "ops/sample_bev.h"
 
 STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) {
   m.impl("sample_bev", TORCH_BOX(&pred::SampleBev::forward));

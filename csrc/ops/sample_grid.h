@@ -13,7 +13,8 @@
 //                      grad_map     : grad[c] b_k is added to cell_k
 //                      grad_grid_a  = sum_k w_k,a E_k + sum_{b != a} v_b sum_k w_k,ab D_k, E_k = sum_c grad[c] U_k[c]
 //   with_grad          out[c]       = sum_k w_k p_k[c],   slopes_a[c] = sum_k w_k,a p_k[c]
-//   its backward,      grad_map     : grad[c] w_k + sum_a G_a[c] w_k,a is added to cell_k
+//   its backward,      grad_map     : grad[c] w_k + sum_a G_a[c] w_k,a is added to cell_k; or, where G_a = v_a g,
+//                                     grad[c] w_k + g[c] b_k
 //   cotangents grad, G grad_grid_a  = sum_k w_k,a D_k + sum_{b != a} sum_k w_k,ab D_b,k, D_b,k = sum_c G_b[c] p_k[c]
 //
 // Maps are channels-last in memory: [B, H, W, C] or [B, D, H, W, C]. Rows are stored as S and computed as Compute<S>;
@@ -38,6 +39,7 @@ struct SampleGridArgs {
   bool border, align_corners;
   const S* grad;            // [B, N, C] gradient of the values; with grad_slopes it may be null
   const S* grad_slopes;     // [B, N, Axes, C] gradient of the values' derivatives, or null
+  const S* grad_along;      // [B, N, C] g, in place of grad_slopes, or null; v is grad_grad_grid
   const S* grad_grad_map;   // [B, (D,) H, W, C] or null
   const T* grad_grad_grid;  // [B, N, Axes] or null
 };

@@ -65,9 +65,7 @@ struct SampleGrid {
       }
       args.border = border;
       args.align_corners = align_corners;
-      const int64_t num_zeros = num_samples() > 0 ? args.channels : 0;
-      zeros = allocate_array<S>(num_zeros);
-      std::fill_n(zeros.get(), num_zeros, S());
+      zeros = allocate_zeros<S>(num_samples() > 0 ? args.channels : 0);
       args.zeros = zeros.get();
     }
 
@@ -179,7 +177,7 @@ struct SampleGrid {
                  [&](int64_t begin, int64_t end) { k.double_backward(a, grad_data, grid_data, begin, end); });
       }
       if (need_map && a.grad_grad_grid) {
-        out_map = scatter<S>(in, true, nullptr);
+        out_map = scatter<S>(in.op.c_str(), in.map, in.args, true, nullptr);
       } else if (need_map) {  // the map enters only through the grid's gradient
         out_map = new_channels_last(in.map);
         torch::stable::zero_(out_map);
@@ -188,8 +186,54 @@ struct SampleGrid {
     });
   }
 
- private:
-  static Tensor no_tensor(const Tensor& like) { return torch::stable::new_empty(like, {0}); }
+  // Adds every sample's gradient to its cells; grad_grid, where not null, gets the samples' grid gradients on the way.
+  template <typename S>
+  static Tensor scatter(const char* op, const Tensor& map, const SampleGridArgs<S, kAxes>& a, bool along_direction,
+                        Compute<S>* grad_grid) {
+    constexpr int64_t kBandRows = 8;
+    const int64_t batch = map.size(0), num_samples = batch * a.num_samples;
+    const auto& k = Op::template table<S>();
+    if (map.numel() == 0) return new_channels_last(map);  // whatever its other sizes are
+    PRED_CHECK(num_samples < int64_t(1) << 31, op, ": grid must have fewer than 2^31 samples where the gradient of ",
+               Op::kMap, " is wanted, got ", num_samples);
+    SampleGridOrder order{nullptr, bits_for(num_samples), {}};
+    int cell_bits = 0;
+    for (int axis = 0; axis < kAxes; ++axis) {
+      order.size_bits[axis] = bits_for(a.size[axis] + 1);
+      cell_bits += order.size_bits[axis];
+    }
+    const int key_bits = bits_for(batch) + cell_bits;
+    PRED_CHECK(key_bits + order.number_bits < 64, op, ": ", Op::kMap,
+               " must have fewer than 2^64 cells times samples, both rounded up to powers of 2, got 2^",
+               key_bits + order.number_bits);
+    const auto sorted = sort_rows<uint64_t>(
+        num_samples, order.number_bits, key_bits,
+        [&](uint64_t* items, int64_t begin, int64_t end) { return k.pack(a, order, items, begin, end); });
+    order.items = sorted.items.get();
+
+    // First item whose lower corner lies in row `low` (from -1 on) of a map, or behind it.
+    const auto find = [&](int64_t map, int64_t low) {
+      const uint64_t key = (uint64_t(map) << order.size_bits[1]) + uint64_t(low + 1);  // may carry: the next map
+      const uint64_t item = key << (cell_bits - order.size_bits[1]) << order.number_bits;
+      return std::lower_bound(order.items, order.items + sorted.count, item) - order.items;
+    };
+    const int64_t height = a.size[1], num_bands = (height + kBandRows - 1) / kBandRows;
+    const int64_t depth = kAxes == 3 ? a.size[kAxes - 1] : 1;
+    Tensor grad_map = new_channels_last(map);
+    S* out = mutable_storage<S>(grad_map);
+    parallel(batch * num_bands, 1, [&](int64_t begin, int64_t end) {
+      std::unique_ptr<Compute<S>[]> sums;
+      if (!std::is_same_v<S, Compute<S>>) sums = allocate_array<Compute<S>>(depth * kBandRows * a.stride[1]);
+      for (int64_t task = begin; task < end; ++task) {
+        SampleGridBand<S> band{task / num_bands, task % num_bands * kBandRows, 0, 0, 0, sums.get()};
+        band.end = std::min(band.begin + kBandRows, height);
+        band.first_item = find(band.map, band.begin - 1);
+        band.last_item = find(band.map, band.end);
+        k.scatter_band(a, order, band, along_direction, out, grad_grid);
+      }
+    });
+    return grad_map;
+  }
 
   // A [B, C, (D,) H, W] tensor whose memory is [B, (D,) H, W, C].
   static Tensor new_channels_last(const Tensor& like) {
@@ -199,6 +243,9 @@ struct SampleGrid {
     for (int64_t dim = kAxes; dim > 0; --dim) tensor = torch::stable::transpose(tensor, dim, dim + 1);
     return tensor;
   }
+
+ private:
+  static Tensor no_tensor(const Tensor& like) { return torch::stable::new_empty(like, {0}); }
 
   static std::tuple<Tensor, Tensor> first_order(const char* suffix, const std::optional<Tensor>& grad,
                                                 const std::optional<Tensor>& grad_slopes, const Tensor& map,
@@ -215,7 +262,7 @@ struct SampleGrid {
       }
       if (need_map) {
         if (need_grid) torch::stable::zero_(grad_grid);  // samples that touch nothing are not visited
-        grad_map = scatter<S>(in, false, data);
+        grad_map = scatter<S>(in.op.c_str(), in.map, in.args, false, data);
       } else if (need_grid) {
         const auto& k = Op::template table<S>();
         parallel(in.num_samples(), in.grain(),
@@ -223,55 +270,6 @@ struct SampleGrid {
       }
       return std::make_tuple(grad_map, grad_grid);
     });
-  }
-
-  // Adds every sample's gradient to its cells; grad_grid, where not null, gets the samples' grid gradients on the way.
-  template <typename S>
-  static Tensor scatter(const Inputs<S>& in, bool along_direction, Compute<S>* grad_grid) {
-    constexpr int64_t kBandRows = 8;
-    const auto& a = in.args;
-    const auto& k = Op::template table<S>();
-    if (in.map.numel() == 0) return new_channels_last(in.map);  // whatever its other sizes are
-    PRED_CHECK(in.num_samples() < int64_t(1) << 31, in.op,
-               ": grid must have fewer than 2^31 samples where the gradient of ", Op::kMap, " is wanted, got ",
-               in.num_samples());
-    SampleGridOrder order{nullptr, bits_for(in.num_samples()), {}};
-    int cell_bits = 0;
-    for (int axis = 0; axis < kAxes; ++axis) {
-      order.size_bits[axis] = bits_for(a.size[axis] + 1);
-      cell_bits += order.size_bits[axis];
-    }
-    const int key_bits = bits_for(in.batch) + cell_bits;
-    PRED_CHECK(key_bits + order.number_bits < 64, in.op, ": ", Op::kMap,
-               " must have fewer than 2^64 cells times samples, both rounded up to powers of 2, got 2^",
-               key_bits + order.number_bits);
-    const auto sorted = sort_rows<uint64_t>(
-        in.num_samples(), order.number_bits, key_bits,
-        [&](uint64_t* items, int64_t begin, int64_t end) { return k.pack(a, order, items, begin, end); });
-    order.items = sorted.items.get();
-
-    // First item whose lower corner lies in row `low` (from -1 on) of a map, or behind it.
-    const auto find = [&](int64_t map, int64_t low) {
-      const uint64_t key = (uint64_t(map) << order.size_bits[1]) + uint64_t(low + 1);  // may carry: the next map
-      const uint64_t item = key << (cell_bits - order.size_bits[1]) << order.number_bits;
-      return std::lower_bound(order.items, order.items + sorted.count, item) - order.items;
-    };
-    const int64_t height = a.size[1], num_bands = (height + kBandRows - 1) / kBandRows;
-    const int64_t depth = kAxes == 3 ? a.size[kAxes - 1] : 1;
-    Tensor grad_map = new_channels_last(in.map);
-    S* out = mutable_storage<S>(grad_map);
-    parallel(in.batch * num_bands, 1, [&](int64_t begin, int64_t end) {
-      std::unique_ptr<Compute<S>[]> sums;
-      if (!std::is_same_v<S, Compute<S>>) sums = allocate_array<Compute<S>>(depth * kBandRows * a.stride[1]);
-      for (int64_t task = begin; task < end; ++task) {
-        SampleGridBand<S> band{task / num_bands, task % num_bands * kBandRows, 0, 0, 0, sums.get()};
-        band.end = std::min(band.begin + kBandRows, height);
-        band.first_item = find(band.map, band.begin - 1);
-        band.last_item = find(band.map, band.end);
-        k.scatter_band(a, order, band, along_direction, out, grad_grid);
-      }
-    });
-    return grad_map;
   }
 };
 

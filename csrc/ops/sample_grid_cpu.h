@@ -139,11 +139,17 @@ PRED_INLINE void dot_rows(const S* source, const S* const (&row)[Rows], int64_t 
 }
 
 // Rows of gradients that one sample sends to its cells: that of the value, and with kRows = 1 + Axes those of the
-// value's derivatives.
+// value's derivatives, with kRows = kAlong that of its derivative along a direction.
+constexpr int kAlong = 2;
+
 template <int kRows, typename S, int Axes>
 PRED_INLINE void gradient_rows(const SampleGridArgs<S, Axes>& a, int64_t sample, const S* (&row)[kRows]) {
   row[0] = a.grad ? a.grad + sample * a.channels : a.zeros;
-  for (int m = 1; m < kRows; ++m) row[m] = a.grad_slopes + (sample * Axes + m - 1) * a.channels;
+  if constexpr (kRows == kAlong) {
+    row[1] = a.grad_along + sample * a.channels;
+  } else {
+    for (int m = 1; m < kRows; ++m) row[m] = a.grad_slopes + (sample * Axes + m - 1) * a.channels;
+  }
 }
 
 // The grid gradient of one sample.
@@ -284,7 +290,11 @@ void scatter_items(const SampleGridArgs<S, Axes>& a, const SampleGridOrder& orde
       } else {
         linear_weights(run.stencil[i], 0, run.weight[i][0]);
       }
-      for (int m = 1; m < kRows; ++m) linear_weights(run.stencil[i], 1 << (m - 1), run.weight[i][m]);
+      if constexpr (kRows == kAlong) {
+        linear_directional(run.stencil[i], a.grad_grad_grid + sample * Axes, run.weight[i][1]);
+      } else {
+        for (int m = 1; m < kRows; ++m) linear_weights(run.stencil[i], 1 << (m - 1), run.weight[i][m]);
+      }
     }
 
     const auto& s = run.stencil[0];
@@ -327,7 +337,9 @@ template <typename S, int Axes>
 void scatter_band(const SampleGridArgs<S, Axes>& a, const SampleGridOrder& order, const SampleGridBand<S>& band,
                   bool along_direction, S* grad_map, Compute<S>* grad_grid) {
   constexpr int kAll = 1 + Axes;
-  if (a.grad_slopes) {
+  if (a.grad_along) {
+    scatter_items<kAlong, false>(a, order, band, false, grad_map, grad_grid);
+  } else if (a.grad_slopes) {
     if (grad_grid) {
       scatter_items<kAll, true>(a, order, band, along_direction, grad_map, grad_grid);
     } else {

@@ -11,14 +11,14 @@ B frames, N points per frame, C BEV channels, H hidden width, K classes, P encod
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, cast
+from typing import Literal, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
-from pred.ops import sample_bev
+from pred.ops import DecodedField, decode_field
+from pred.ops.decode_field import encode, project_bev
 
 RIDGE = 1e-4
 """Relative ridge of the initial fit; it keeps the fitted weights small."""
@@ -40,6 +40,10 @@ class FieldConfig:
     """Metres of signed distance per unit of network output."""
     num_classes: int = 19
     """Semantic classes K (Cityscapes train ids)."""
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """Of the decoder's products; parameters stay float32."""
+    recompute: bool = False
+    """Whether the backward pass computes activations again in place of keeping them."""
 
     def __post_init__(self) -> None:
         for name, minimum in (("hidden", 1), ("layers", 2), ("frequencies", 0), ("num_classes", 1)):
@@ -50,17 +54,6 @@ class FieldConfig:
                 raise ValueError(f"FieldConfig: {name} must be positive, got {getattr(self, name)}")
 
 
-class FieldOutput(NamedTuple):
-    """What the field holds at the queried points."""
-
-    sdf: Tensor
-    """Signed distance `[B, N]`, metres, positive in free space."""
-    semantics: Tensor | None
-    """Class logits `[B, N, K]`; None where they were not asked for."""
-    gradient: Tensor | None
-    """d sdf / d point `[B, N, 3]`, metres per metre; None where it was not asked for."""
-
-
 class FieldDecoder(nn.Module):
     """BEV-conditioned signed distance and semantics.
 
@@ -69,9 +62,7 @@ class FieldDecoder(nn.Module):
     output layer's first row is the signed distance in units of `sdf_scale_m`, the other K are class
     logits. Outside the range box F(r) is zero.
 
-    Two rewritings save time and change nothing: the first layer's feature columns are applied to
-    the map once (bilinear sampling is linear), and the gradient is one analytic sweep back through
-    the MLP instead of `autograd.grad(create_graph=True)`.
+    `pred.ops.decode_field` does the work: compiled, or in plain PyTorch where `PRED_BACKEND` says so.
 
     Initially the signed distance is positive around the centre of the range box and falls through
     zero towards its faces, whatever the map holds: see `_initialise`.
@@ -82,10 +73,6 @@ class FieldDecoder(nn.Module):
         point_range: range box (x_min, y_min, z_min, x_max, y_max, z_max) that the map spans, metres.
     """
 
-    range_centre_m: Tensor
-    range_half_extent_m: Tensor
-    frequencies: Tensor
-
     def __init__(
         self,
         channels: int,
@@ -95,14 +82,7 @@ class FieldDecoder(nn.Module):
         super().__init__()
         self.channels = channels
         self.config = config
-        low, high = torch.tensor(point_range, dtype=torch.float64).view(2, 3)
-        # Not part of the state dict: the configuration fixes them.
-        for name, value in (
-            ("range_centre_m", (low + high) / 2),
-            ("range_half_extent_m", (high - low) / 2),
-            ("frequencies", 2.0 ** torch.arange(config.frequencies, dtype=torch.float64)),
-        ):
-            self.register_buffer(name, value.to(torch.get_default_dtype()), persistent=False)
+        self.point_range = point_range
         encoding_width = 3 + 6 * config.frequencies
         widths = [channels + encoding_width] + [config.hidden] * (config.layers - 1)
         widths.append(1 + config.num_classes)
@@ -115,11 +95,10 @@ class FieldDecoder(nn.Module):
         points_m: Tensor,  # [B, N, 3]
         with_gradient: bool = False,
         semantics: bool = True,
-    ) -> FieldOutput:
+    ) -> DecodedField:
         """Decodes points given in metres in the map's (LiDAR) frame.
 
-        Differentiable in the map and the parameters, the gradient output included (once: for the
-        Eikonal term); in the points as far as `sdf` and `semantics` go.
+        Differentiable once in the map, the points and the parameters, the gradient output included.
 
         Args:
             bev: BEV map, row = y, column = x, spanning the range box.
@@ -134,9 +113,7 @@ class FieldDecoder(nn.Module):
 
         Callers that decode several sets of points from one map do this once.
         """
-        (first, *_), _ = self._linear_layers()
-        weight = first.weight[:, : self.channels]
-        return F.linear(bev.permute(0, 2, 3, 1), weight).permute(0, 3, 1, 2)
+        return project_bev(bev, self._linear_layers()[0].weight, self.config.precision)
 
     def decode(
         self,
@@ -144,47 +121,29 @@ class FieldDecoder(nn.Module):
         points_m: Tensor,  # [B, N, 3]
         with_gradient: bool = False,
         semantics: bool = True,
-    ) -> FieldOutput:
+    ) -> DecodedField:
         """As `forward`, from a map that `project` returned."""
-        hidden_layers, output_layer = self._linear_layers()
-        position = (points_m - self.range_centre_m) / self.range_half_extent_m
-        encoding = self._encode(position)
-
-        if with_gradient:
-            # Sampling needs its graph for d feature / d point even where gradients are off.
-            with torch.enable_grad():
-                grid = position[..., :2]
-                if not grid.requires_grad:
-                    grid = grid.detach().requires_grad_()
-                sampled = sample_bev(projected, grid)
-        else:
-            sampled = sample_bev(projected, position[..., :2])
-
-        first = hidden_layers[0]
-        activation = sampled + F.linear(encoding, first.weight[:, self.channels :], first.bias)
-        slopes = []
-        for index, layer in enumerate(hidden_layers):
-            if index > 0:
-                activation = F.linear(activation, layer.weight, layer.bias)
-            if with_gradient:
-                activation, slope = _SoftplusAndSlope.apply(activation, self.config.softplus_beta)
-                slopes.append(slope)
-            else:
-                activation = F.softplus(activation, self.config.softplus_beta)
-
-        rows = slice(None) if semantics else slice(1)
-        output = F.linear(activation, output_layer.weight[rows], output_layer.bias[rows])
-        sdf = output[..., 0] * self.config.sdf_scale_m
-        return FieldOutput(
-            sdf,
-            output[..., 1:] if semantics else None,
-            self._gradient(grid, sampled, encoding, slopes) if with_gradient else None,
+        weights: list[Tensor] = [layer.weight for layer in self._linear_layers()]
+        biases: list[Tensor] = [layer.bias for layer in self._linear_layers()]
+        if not semantics:
+            weights[-1], biases[-1] = weights[-1][:1], biases[-1][:1]
+        return decode_field(
+            projected,
+            points_m,
+            weights,
+            biases,
+            self.point_range,
+            frequencies=self.config.frequencies,
+            softplus_beta=self.config.softplus_beta,
+            sdf_scale=self.config.sdf_scale_m,
+            with_gradient=with_gradient,
+            projected=True,
+            precision=self.config.precision,
+            recompute=self.config.recompute,
         )
 
-    def _linear_layers(self) -> tuple[list[nn.Linear], nn.Linear]:
-        """Hidden layers and output layer."""
-        *hidden_layers, output_layer = cast("list[nn.Linear]", list(self.layers))
-        return hidden_layers, output_layer
+    def _linear_layers(self) -> list[nn.Linear]:
+        return cast("list[nn.Linear]", list(self.layers))
 
     @torch.no_grad()
     def _initialise(self) -> None:
@@ -202,9 +161,9 @@ class FieldDecoder(nn.Module):
         slope, and the features of the untrained encoder start weak. The row is a ridge regression
         on the activations at random points under random features, so the map has little say in it.
         """
-        hidden_layers, output_layer = self._linear_layers()
+        *hidden_layers, output_layer = self._linear_layers()
         first = hidden_layers[0]
-        octaves = (1 / self.frequencies).repeat_interleave(3)
+        octaves = 0.5 ** torch.arange(self.config.frequencies).repeat_interleave(3)
         first.weight[:, : self.channels].normal_(0, 0.1 * self.channels**-0.5)
         first.weight[:, self.channels :].normal_().mul_(torch.cat([torch.ones(3), octaves, octaves]))
         first.bias.uniform_(-1, 1)
@@ -216,10 +175,12 @@ class FieldDecoder(nn.Module):
         position = 2 * torch.rand(num_points, 3) - 1
         position[::2] *= torch.rand(num_points // 2, 1)  # half of them nearer to the centre
         features = torch.randn(num_points, self.channels).relu()  # as a batch norm and ReLU give
-        activation = torch.cat([features, self._encode(position)], dim=1)
+        activation = torch.cat([features, encode(position, self.config.frequencies)], dim=1)
         for layer in hidden_layers:
             activation = F.softplus(layer(activation), self.config.softplus_beta)
-        sdf_m = self.range_half_extent_m.min() * (0.9 - 1.5 * position.norm(dim=1))
+        low, high = torch.tensor(self.point_range).view(2, 3)
+        half_extent_m = (high - low).min() / 2
+        sdf_m = half_extent_m * (0.9 - 1.5 * position.norm(dim=1))
 
         inputs = F.pad(activation, (0, 1), value=1.0).double()
         normal = inputs.T @ inputs
@@ -227,50 +188,3 @@ class FieldDecoder(nn.Module):
         row = torch.linalg.solve(normal, inputs.T @ (sdf_m / self.config.sdf_scale_m).double())
         output_layer.weight[0] = row[:-1]
         output_layer.bias[0] = row[-1]
-
-    def _encode(self, position: Tensor) -> Tensor:
-        """Positional encoding `[..., P]` of scaled coordinates `[..., 3]`."""
-        angles = (position[..., None, :] * self.frequencies[:, None]).flatten(-2)
-        return torch.cat([position, angles.sin(), angles.cos()], dim=-1)
-
-    def _gradient(
-        self,
-        grid: Tensor,  # [B, N, 2]
-        sampled: Tensor,  # [B, N, hidden], computed from grid
-        encoding: Tensor,  # [B, N, P]
-        slopes: list[Tensor],  # per hidden layer [B, N, hidden]
-    ) -> Tensor:
-        """d sdf / d point by one sweep from the output row back to the encoding and the map."""
-        hidden_layers, output_layer = self._linear_layers()
-        by_activation = slopes[-1] * (output_layer.weight[0] * self.config.sdf_scale_m)
-        for layer, slope in zip(hidden_layers[:0:-1], slopes[-2::-1], strict=True):
-            by_activation = (by_activation @ layer.weight) * slope
-
-        by_encoding = by_activation @ hidden_layers[0].weight[:, self.channels :]
-        width = 3 * self.config.frequencies
-        by_position, by_sine, by_cosine = by_encoding.split([3, width, width], dim=-1)
-        _, sine, cosine = encoding.split([3, width, width], dim=-1)
-        by_angle = (cosine * by_sine - sine * by_cosine).unflatten(-1, (self.config.frequencies, 3))
-        by_position = by_position + (by_angle * self.frequencies[:, None]).sum(-2)
-
-        (by_grid,) = torch.autograd.grad(sampled, grid, by_activation, create_graph=torch.is_grad_enabled())
-        return (by_position + F.pad(by_grid, (0, 1))) / self.range_half_extent_m
-
-
-class _SoftplusAndSlope(torch.autograd.Function):
-    """Softplus and its derivative, sigmoid(beta z), with one cheap backward for both."""
-
-    @staticmethod
-    def forward(ctx: Any, activation: Tensor, beta: float) -> tuple[Tensor, Tensor]:
-        slope = torch.sigmoid(activation * beta)
-        ctx.save_for_backward(slope)
-        ctx.beta = beta
-        return F.softplus(activation, beta), slope
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_value: Tensor, grad_slope: Tensor) -> tuple[Tensor, None]:
-        (slope,) = ctx.saved_tensors
-        # d slope / d activation = beta slope (1 - slope)
-        bend = torch.addcmul(grad_slope, grad_slope, slope, value=-1).mul_(ctx.beta)
-        return bend.add_(grad_value).mul_(slope), None

@@ -265,7 +265,8 @@ class _SumOfParts(torch.autograd.Function):
         # Cut off from what lies before them, where each part's backward pass would go otherwise.
         inputs = [x.detach().requires_grad_(x.requires_grad) for x in tensors[:num_inputs]]
         leaves = [x for x in (*inputs, *tensors[num_inputs:]) if x.requires_grad]
-        sums = [torch.zeros_like(leaf) for leaf in leaves]
+        # A half-precision map gets hundreds of small gradients, which its own dtype would swallow.
+        sums = [torch.zeros_like(leaf, dtype=torch.promote_types(leaf.dtype, torch.float32)) for leaf in leaves]
         total = inputs[0].new_zeros(())
         with torch.enable_grad():
             for part in parts(*inputs):
@@ -275,6 +276,7 @@ class _SumOfParts(torch.autograd.Function):
                         sum_ += gradient
                 total += part.detach()
         ctx.save_for_backward(*sums)
+        ctx.dtypes = [tensor.dtype for tensor in tensors]
         return total
 
     @staticmethod
@@ -282,4 +284,12 @@ class _SumOfParts(torch.autograd.Function):
     def backward(ctx: Any, grad_total: Tensor) -> tuple[Tensor | None, ...]:
         sums = iter(ctx.saved_tensors)
         needed = ctx.needs_input_grad[2:]
-        return None, None, *(grad_total * next(sums) if need else None for need in needed)
+        found = (grad_total * next(sums) if need else None for need in needed)
+        return (
+            None,
+            None,
+            *(
+                None if gradient is None else gradient.to(dtype)
+                for gradient, dtype in zip(found, ctx.dtypes, strict=True)
+            ),
+        )

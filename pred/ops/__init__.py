@@ -14,6 +14,7 @@ from pred.ops._sampling import SampledWithGrad
 from pred.ops.ball_query import Ball, ball_query
 from pred.ops.composite_alpha import composite_alpha
 from pred.ops.composite_rays import composite_rays
+from pred.ops.decode_field import DecodedField, decode_field
 from pred.ops.farthest_point_sample import farthest_point_sample
 from pred.ops.knn import Neighbors, knn
 from pred.ops.resample_rays import resample_rays
@@ -30,6 +31,7 @@ __all__ = [  # in the order of docs/ops
     "sample_bev_with_grad",
     "sample_volume",
     "sample_volume_with_grad",
+    "decode_field",
     "sdf_to_alpha",
     "composite_rays",
     "composite_alpha",
@@ -42,6 +44,7 @@ __all__ = [  # in the order of docs/ops
     "knn",
     "ball_query",
     "SampledWithGrad",
+    "DecodedField",
     "Composite",
     "Voxels",
     "HardVoxels",

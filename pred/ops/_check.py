@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Sequence
 
@@ -83,6 +84,22 @@ def check_number(op: str, name: str, value: object) -> None:
         raise TypeError(f"{op}: {name} must be a number, got {type(value).__name__}") from None
     except OverflowError:
         raise ValueError(f"{op}: {name} must be in the range of float64, got a larger whole number") from None
+
+
+def check_floats(op: str, name: str, values: Sequence[float], count: int) -> list[float]:
+    """``count`` finite numbers."""
+    try:
+        size = len(values)
+    except TypeError:  # a tensor or array of no dimensions too
+        raise TypeError(f"{op}: {name} must hold {count} numbers, got {type(values).__name__}") from None
+    if size != count:  # before a tensor of any size is made a list
+        raise ValueError(f"{op}: {name} must hold {count} finite numbers, got {size}")
+    for value in values:
+        check_number(op, name, value)
+    floats = [float(value) for value in values]
+    if not all(math.isfinite(value) for value in floats):
+        raise ValueError(f"{op}: {name} must hold {count} finite numbers, got {floats}")
+    return floats
 
 
 def check_count(op: str, name: str, value: int, least: int = 0) -> None:

@@ -5,6 +5,7 @@
 from pred.ops.ball_query import ball_query_reference as ball_query
 from pred.ops.composite_alpha import composite_alpha_reference as composite_alpha
 from pred.ops.composite_rays import composite_rays_reference as composite_rays
+from pred.ops.decode_field import decode_field_reference as decode_field
 from pred.ops.farthest_point_sample import farthest_point_sample_reference as farthest_point_sample
 from pred.ops.knn import knn_reference as knn
 from pred.ops.resample_rays import resample_rays_reference as resample_rays
@@ -23,6 +24,7 @@ __all__ = [  # in the order of docs/ops
     "sample_bev_with_grad",
     "sample_volume",
     "sample_volume_with_grad",
+    "decode_field",
     "sdf_to_alpha",
     "composite_rays",
     "composite_alpha",

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import FLOATING, HALF, check_dtype, check_number, check_offsets, check_tensors
+from pred.ops._check import FLOATING, HALF, check_dtype, check_floats, check_offsets, check_tensors
 
 _MAX_KEYS = 2**62
 _MAX_CELLS = 2**30
@@ -112,7 +112,7 @@ def check_voxelize_arguments(
         raise ValueError(f"{op}: points must have shape [N, C] with C >= 3, got {list(points.shape)}")
     check_dtype(op, "points", points, FLOATING + HALF)
     check_offsets(op, "batch_offsets", batch_offsets, "BN", "points", points)
-    size, bounds = _floats(op, "voxel_size", voxel_size, 3), _floats(op, "point_range", point_range, 6)
+    size, bounds = check_floats(op, "voxel_size", voxel_size, 3), check_floats(op, "point_range", point_range, 6)
     grid = _grid_size(op, size, bounds)
     frame_keys = math.prod([1 << (cells - 1).bit_length() for cells in grid])
     if batch_offsets.shape[0] - 1 > _MAX_KEYS // frame_keys:
@@ -121,21 +121,6 @@ def check_voxelize_arguments(
             f"got a grid of {grid[0]} x {grid[1]} x {grid[2]} for {batch_offsets.shape[0] - 1} frames"
         )
     return size, bounds, grid
-
-
-def _floats(op: str, name: str, values: Sequence[float], count: int) -> list[float]:
-    try:
-        size = len(values)
-    except TypeError:  # a tensor or array of no dimensions too
-        raise TypeError(f"{op}: {name} must hold {count} numbers, got {type(values).__name__}") from None
-    if size != count:  # before a tensor of any size is made a list
-        raise ValueError(f"{op}: {name} must hold {count} finite numbers, got {size}")
-    for value in values:
-        check_number(op, name, value)
-    floats = [float(value) for value in values]
-    if not all(math.isfinite(value) for value in floats):
-        raise ValueError(f"{op}: {name} must hold {count} finite numbers, got {floats}")
-    return floats
 
 
 def _grid_size(op: str, voxel_size: Sequence[float], point_range: Sequence[float]) -> list[int]:

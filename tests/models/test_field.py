@@ -11,10 +11,12 @@ import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from pred.losses import eikonal_loss
 from pred.models.field import FieldConfig, FieldDecoder
 from pred.ops import sample_bev
+from pred.ops.decode_field import encode
 
 RANGE = (-8.0, -4.0, -1.0, 8.0, 4.0, 3.0)
 CENTRE = torch.tensor([0.0, 0.0, 1.0])
@@ -68,9 +70,8 @@ def test_sizes_of_the_default() -> None:
 
 
 def test_encoding_by_hand() -> None:
-    field, _, _ = make()
     a, b, c = 0.5, -1.0, 0.25
-    encoding = field._encode(torch.tensor([a, b, c], dtype=torch.float64))
+    encoding = encode(torch.tensor([a, b, c], dtype=torch.float64), 2)
     expected = [a, b, c]
     expected += [math.sin(x) for x in (a, b, c)] + [math.sin(2 * x) for x in (a, b, c)]
     expected += [math.cos(x) for x in (a, b, c)] + [math.cos(2 * x) for x in (a, b, c)]
@@ -255,3 +256,31 @@ def test_initial_distance_falls_from_the_centre_through_zero(
 def test_bad_configuration(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         FieldConfig(**changes)
+
+
+class _Sizes(TorchDispatchMode):
+    """Shapes of all results of torch's ops."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shapes: set[tuple[int, ...]] = set()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        results = out if isinstance(out, tuple | list) else [out]
+        self.shapes |= {tuple(x.shape) for x in results if isinstance(x, Tensor)}
+        return out
+
+
+@pytest.mark.parametrize("recompute", [False, True])
+def test_no_row_of_hidden_width_per_sample(recompute: bool, native: None) -> None:
+    """But for what is kept for the backward pass."""
+    hidden, samples = 96, 531
+    field = FieldDecoder(5, FieldConfig(hidden=hidden, layers=3, num_classes=4, recompute=recompute), RANGE)
+    bev, points = torch.randn(1, 5, 8, 8, requires_grad=True), torch.rand(1, samples, 3)
+    with _Sizes() as sizes:
+        out = field(bev, points, with_gradient=True)
+        assert out.semantics is not None and out.gradient is not None
+        (out.sdf.sum() + out.semantics.sum() + out.gradient.square().sum()).backward()
+    wide = {shape for shape in sizes.shapes if samples in shape and hidden in shape}
+    assert wide == (set() if recompute else {(2, samples, hidden), (1, samples, hidden)})

@@ -299,6 +299,13 @@ def test_parts_change_nothing(samples_per_part: int) -> None:
     assert_same_gradients(output_gradients, expected_gradients)
 
 
+def test_sum_of_parts_adds_in_float32() -> None:
+    """A thousand ones are a thousand, which bfloat16 loses count of at 256."""
+    x = torch.zeros(3, dtype=torch.bfloat16, requires_grad=True)
+    sum_of_parts(lambda x: (x.sum() for _ in range(1000)), [x], []).backward()
+    assert x.grad is not None and x.grad.dtype == torch.bfloat16 and x.grad.tolist() == [1000.0] * 3
+
+
 def test_sum_of_parts_is_the_sum() -> None:
     generator = torch.Generator().manual_seed(0)
     weight = torch.randn(3, generator=generator, dtype=torch.float64, requires_grad=True)

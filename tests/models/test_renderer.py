@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pred.models.field import FieldConfig, FieldDecoder, FieldOutput
+from pred.models.field import FieldConfig, FieldDecoder
 from pred.models.renderer import (
     RaySamples,
     RenderedRays,
@@ -22,6 +22,7 @@ from pred.models.renderer import (
     ray_box_interval,
     stratified_samples,
 )
+from pred.ops import DecodedField
 
 RANGE = (-20.0, -10.0, -2.0, 20.0, 10.0, 4.0)
 NO_MAP = torch.zeros(1, 1, 1, 1)
@@ -35,11 +36,11 @@ class Wall(FieldDecoder):
 
     def decode(
         self, projected: Tensor, points_m: Tensor, with_gradient: bool = False, semantics: bool = True
-    ) -> FieldOutput:
+    ) -> DecodedField:
         sdf = 12 - points_m[..., 0]
         logits = 50 * F.one_hot((points_m[..., 1] > 0).long(), 2).to(points_m)
         gradient = points_m.new_tensor((-1.0, 0, 0)).expand_as(points_m)
-        return FieldOutput(sdf, logits if semantics else None, gradient if with_gradient else None)
+        return DecodedField(sdf, logits if semantics else None, gradient if with_gradient else None)
 
 
 def unit(*direction: float) -> Tensor:

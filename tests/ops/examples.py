@@ -7,6 +7,7 @@ A new op is one builder and one entry (or a few) in EXAMPLES.
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from benchmarks.case import gather
 from pred import ops
 from pred.ops import reference
 
@@ -41,6 +43,10 @@ class Source:
     def size(self, default: int, low: int, high: int) -> int:
         """Any other size, in [low, high]."""
         return default
+
+    def tensors(self, default: int, low: int, high: int) -> int:
+        """How many tensors a list argument has."""
+        return self.size(default, low, high)
 
     def normal(self, *shape: int) -> Tensor:
         return torch.randn(shape, generator=self._generator, dtype=torch.float64)
@@ -114,13 +120,21 @@ class Example:
     @property
     def native(self) -> Callable[..., Any]:
         """The public function, which runs compiled where PRED_BACKEND says so."""
-        function: Callable[..., Any] = getattr(ops, self.op)
-        return function
+        return by_element(getattr(ops, self.op))
 
     @property
     def reference(self) -> Callable[..., Any]:
-        function: Callable[..., Any] = getattr(reference, self.op)
-        return function
+        return by_element(getattr(reference, self.op))
+
+
+def by_element(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Also takes the elements of an argument that is a list, each by its own name: ``**{"weights[0]": tensor}``."""
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        return function(*arguments, **gather(named))
+
+    return call
 
 
 def outputs(result: Any) -> dict[str, Tensor]:
@@ -233,6 +247,25 @@ def _knn(source: Source) -> Arguments:
 
 def _ball_query(source: Source) -> Arguments:
     return _queries(source) | {"radius": 2.5, "max_points": source.size(6, 0, 20)}
+
+
+def _decode_field(source: Source) -> Arguments:
+    """Elements of ``weights`` and ``biases`` by their own names, see ``by_element``. Points are off the lines through
+    cell centres, where the derivative jumps."""
+    frames, channels, classes = source.size(2, 0, 3), source.size(5, 1, 40), source.size(4, 0, 20)
+    hidden, layers, frequencies = source.size(20, 1, 70), source.tensors(3, 2, 5), source.size(2, 0, 4)
+    widths = [channels + 3 + 6 * frequencies, *[hidden] * (layers - 1), 1 + classes]
+    arguments: Arguments = {
+        "bev": source.normal(frames, channels, 8, 16),
+        "points": source.dyadic(-10, 10, frames, source.count, 3, parts=8) + 1 / 16,
+        "point_range": (-8.0, -4.0, -2.0, 8.0, 4.0, 2.0),
+        "frequencies": frequencies,
+        "softplus_beta": 3.0,
+        "sdf_scale": 2.0,
+    }
+    pairs = list(zip(widths, widths[1:], strict=False))
+    arguments |= {f"weights[{i}]": source.normal(out, into) * into**-0.5 for i, (into, out) in enumerate(pairs)}
+    return arguments | {f"biases[{i}]": source.normal(out) * 0.1 for i, (_, out) in enumerate(pairs)}
 
 
 def _rays(source: Source) -> Arguments:
@@ -354,6 +387,12 @@ _PDF_MODES: list[Arguments] = [
     {"mode": "nerfstudio", "histogram_padding": 0.0, "min_width": 1e-5},
 ]
 
+# Frequencies up to 2^3 multiply the rounding of a position, and five layers that of what they are given.
+_FIELD: dict[str, Any] = {
+    "differentiable": ("bev", "points", *(f"{kind}[{i}]" for kind in ("weights", "biases") for i in range(4))),
+    "tolerance": 5,
+}
+
 _CLOUDS: dict[str, Any] = {"features": ("points", "queries"), "reference_compiles": False}
 
 EXAMPLES = [
@@ -361,6 +400,7 @@ EXAMPLES = [
     *_examples("sample_bev_with_grad", _sample_bev, *_PADDINGS, **_BEV),
     *_examples("sample_volume", _sample_volume, *_PADDINGS, order=2, **_VOLUME),
     *_examples("sample_volume_with_grad", _sample_volume, *_PADDINGS, **_VOLUME),
+    *_examples("decode_field", _decode_field, {}, {"with_gradient": True}, {"recompute": True}, **_FIELD),
     *_examples(
         "segment_reduce",
         _segment_reduce,
