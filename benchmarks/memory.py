@@ -39,8 +39,8 @@ def reset_peak() -> int | None:
         return None
 
 
-def status_bytes(name: str) -> int:
-    for line in Path("/proc/self/status").read_text().splitlines():
+def status_bytes(name: str, path: str = "/proc/self/status") -> int:
+    for line in Path(path).read_text().splitlines():
         if line.startswith(name + ":"):
             return 1024 * int(line.split()[1])
-    raise OSError(f"/proc/self/status holds no {name}")
+    raise OSError(f"{path} holds no {name}")

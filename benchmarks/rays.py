@@ -25,7 +25,7 @@ from benchmarks.allocator import current_allocator, enter_allocator
 from benchmarks.bench_step import contender
 from benchmarks.cases import SIZES
 from benchmarks.measure import machine_record
-from benchmarks.memory import added_peak_bytes
+from benchmarks.memory import added_peak_bytes, status_bytes
 
 NAMES = ("ours", "ours, recompute", "ours, bf16")
 RAYS = (1024, 2048, 4096, 8192, 16384)
@@ -37,7 +37,8 @@ def measure(name: str, sizes_name: str, rays: Sequence[int], rounds: int) -> lis
     """Median time of a step and the memory that it adds, by the number of rays."""
     found: list[dict[str, Any]] = []
     for count in rays:
-        if found and (needed := 1.2 * found[-1]["added_bytes"] * count / found[-1]["rays"]) > free_bytes():
+        needed = 1.2 * found[-1]["added_bytes"] * count / found[-1]["rays"] if found else 0.0
+        if needed > status_bytes("MemAvailable", "/proc/meminfo"):
             print(f"{name}: {count} rays left out, which would take {needed / 1e9:.0f} GB")
             break
         run = contender(name, replace(SIZES[sizes_name], step_rays=count // 2))
@@ -51,14 +52,6 @@ def measure(name: str, sizes_name: str, rays: Sequence[int], rounds: int) -> lis
         found.append({"rays": count, "median_s": median, "times_s": times, "added_bytes": added})
         print(f"{name}: {count:6} rays {median:7.3f} s  {1e6 * median / count:7.1f} us/ray  {added / 1e6:7.0f} MB")
     return found
-
-
-def free_bytes() -> float:
-    """Memory that the system could give."""
-    for line in Path("/proc/meminfo").read_text().splitlines():
-        if line.startswith("MemAvailable:"):
-            return 1024.0 * int(line.split()[1])
-    return float("inf")
 
 
 def draw(record: dict[str, Any], path: Path) -> None:
