@@ -43,7 +43,7 @@ def test_direct_calls_are_checked(native: None) -> None:
     bev, grid = torch.zeros(1, 2, 3, 4), torch.zeros(1, 5, 2)
     with pytest.raises(KERNEL_ERROR, match=r"sample_bev: grid must have shape \[1, N, 2\], got \[2, 5, 2\]"):
         torch.ops.pred.sample_bev(bev, grid.expand(2, -1, -1), False, False)
-    with pytest.raises(KERNEL_ERROR, match="sample_bev: dtype must be float32, float64, bfloat16 or float16"):
+    with pytest.raises(KERNEL_ERROR, match="sample_bev: dtype must be float32, float64, bfloat16 or float16, got Int"):
         torch.ops.pred.sample_bev(bev.int(), grid, False, False)
 
 

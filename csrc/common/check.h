@@ -67,72 +67,51 @@ T read_sharpness(const char* op, const Tensor& inv_s, ScalarType dtype) {
   return value;
 }
 
-// Calls `body` with T = float or double.
-#define PRED_DISPATCH_FLOAT(op, dtype, ...)                                                  \
-  [&] {                                                                                      \
-    switch (dtype) {                                                                         \
-      case ::pred::ScalarType::Float: {                                                      \
-        using T = float;                                                                     \
-        return __VA_ARGS__();                                                                \
-      }                                                                                      \
-      case ::pred::ScalarType::Double: {                                                     \
-        using T = double;                                                                    \
-        return __VA_ARGS__();                                                                \
-      }                                                                                      \
-      default:                                                                               \
-        throw std::invalid_argument(std::string(op) + ": dtype must be float32 or float64"); \
-    }                                                                                        \
+[[noreturn]] inline void refuse_dtype(const std::string& op, const char* allowed, ScalarType dtype) {
+  throw std::invalid_argument(op + ": dtype must be " + allowed + ", got " + torch::headeronly::toString(dtype));
+}
+
+#define PRED_DISPATCH_CASE(dtype, Stored, ...)          \
+  case ::pred::ScalarType::dtype: {                     \
+    using S [[maybe_unused]] = Stored;                  \
+    using T [[maybe_unused]] = ::pred::Compute<Stored>; \
+    return __VA_ARGS__();                               \
+  }
+
+// These call a body with S, the type of what is stored, and T = Compute<S>. Pointers to storage: storage<S>(tensor),
+// mutable_storage<S>(tensor).
+#define PRED_DISPATCH_FLOAT(op, dtype, ...)                    \
+  [&] {                                                        \
+    switch (dtype) {                                           \
+      PRED_DISPATCH_CASE(Float, float, __VA_ARGS__)            \
+      PRED_DISPATCH_CASE(Double, double, __VA_ARGS__)          \
+      default:                                                 \
+        ::pred::refuse_dtype(op, "float32 or float64", dtype); \
+    }                                                          \
   }()
 
-// Calls `body` with S = float, double, BFloat16 or Float16, the type of what is stored, and T = Compute<S>. Pointers to
-// storage: storage<S>(tensor), mutable_storage<S>(tensor).
-#define PRED_DISPATCH_STORAGE(op, dtype, ...)                                                                   \
-  [&] {                                                                                                         \
-    switch (dtype) {                                                                                            \
-      case ::pred::ScalarType::BFloat16: {                                                                      \
-        using S = ::pred::BFloat16;                                                                             \
-        using T [[maybe_unused]] = float;                                                                       \
-        return __VA_ARGS__();                                                                                   \
-      }                                                                                                         \
-      case ::pred::ScalarType::Half: {                                                                          \
-        using S = ::pred::Float16;                                                                              \
-        using T [[maybe_unused]] = float;                                                                       \
-        return __VA_ARGS__();                                                                                   \
-      }                                                                                                         \
-      case ::pred::ScalarType::Float: {                                                                         \
-        using S = float;                                                                                        \
-        using T [[maybe_unused]] = float;                                                                       \
-        return __VA_ARGS__();                                                                                   \
-      }                                                                                                         \
-      case ::pred::ScalarType::Double: {                                                                        \
-        using S = double;                                                                                       \
-        using T [[maybe_unused]] = double;                                                                      \
-        return __VA_ARGS__();                                                                                   \
-      }                                                                                                         \
-      default:                                                                                                  \
-        throw std::invalid_argument(std::string(op) + ": dtype must be float32, float64, bfloat16 or float16"); \
-    }                                                                                                           \
+// The types of products' operands.
+#define PRED_DISPATCH_FACTOR(op, dtype, ...)                             \
+  [&] {                                                                  \
+    switch (dtype) {                                                     \
+      PRED_DISPATCH_CASE(Float, float, __VA_ARGS__)                      \
+      PRED_DISPATCH_CASE(Double, double, __VA_ARGS__)                    \
+      PRED_DISPATCH_CASE(BFloat16, ::pred::BFloat16, __VA_ARGS__)        \
+      default:                                                           \
+        ::pred::refuse_dtype(op, "float32, float64 or bfloat16", dtype); \
+    }                                                                    \
   }()
 
-// Calls the body with S: float, double or BFloat16.
-#define PRED_DISPATCH_FIELD(op, dtype, ...)                                                            \
-  [&] {                                                                                                \
-    switch (dtype) {                                                                                   \
-      case ::pred::ScalarType::BFloat16: {                                                             \
-        using S = ::pred::BFloat16;                                                                    \
-        return __VA_ARGS__();                                                                          \
-      }                                                                                                \
-      case ::pred::ScalarType::Float: {                                                                \
-        using S = float;                                                                               \
-        return __VA_ARGS__();                                                                          \
-      }                                                                                                \
-      case ::pred::ScalarType::Double: {                                                               \
-        using S = double;                                                                              \
-        return __VA_ARGS__();                                                                          \
-      }                                                                                                \
-      default:                                                                                         \
-        throw std::invalid_argument(std::string(op) + ": dtype must be float32, float64 or bfloat16"); \
-    }                                                                                                  \
+#define PRED_DISPATCH_STORAGE(op, dtype, ...)                                     \
+  [&] {                                                                           \
+    switch (dtype) {                                                              \
+      PRED_DISPATCH_CASE(Float, float, __VA_ARGS__)                               \
+      PRED_DISPATCH_CASE(Double, double, __VA_ARGS__)                             \
+      PRED_DISPATCH_CASE(BFloat16, ::pred::BFloat16, __VA_ARGS__)                 \
+      PRED_DISPATCH_CASE(Half, ::pred::Float16, __VA_ARGS__)                      \
+      default:                                                                    \
+        ::pred::refuse_dtype(op, "float32, float64, bfloat16 or float16", dtype); \
+    }                                                                             \
   }()
 
 template <typename S>

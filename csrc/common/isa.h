@@ -60,10 +60,10 @@ const Table& pick(Isa isa, const Table& baseline, const Table& avx2, const Table
 #define PRED_KERNELS(name) (::pred::active_isa(), ::pred::isa_default::name)
 #endif
 
-// Defines kernels<T>(): the table name_f32 or name_f64 of the level in force.
+// Defines name_kernels<T>(): the table name_f32 or name_f64 of the level in force.
 #define PRED_KERNELS_BY_TYPE(Table, name)   \
   template <typename T>                     \
-  const Table<T>& kernels() {               \
+  const Table<T>& name##_kernels() {        \
     if constexpr (std::is_same_v<T, float>) \
       return PRED_KERNELS(name##_f32);      \
     else                                    \
@@ -73,7 +73,7 @@ const Table& pick(Isa isa, const Table& baseline, const Table& avx2, const Table
 // The same for tables by the type of products' operands: name_f32, name_f64 or name_bf16.
 #define PRED_KERNELS_BY_FACTOR(Table, name)       \
   template <typename S>                           \
-  const Table<S>& kernels() {                     \
+  const Table<S>& name##_kernels() {              \
     if constexpr (std::is_same_v<S, float>)       \
       return PRED_KERNELS(name##_f32);            \
     else if constexpr (std::is_same_v<S, double>) \
@@ -85,7 +85,7 @@ const Table& pick(Isa isa, const Table& baseline, const Table& avx2, const Table
 // The same for tables by storage type (math/half.h): name_f32, name_f64, name_bf16 or name_f16.
 #define PRED_KERNELS_BY_STORAGE(Table, name)        \
   template <typename S>                             \
-  const Table<S>& kernels() {                       \
+  const Table<S>& name##_kernels() {                \
     if constexpr (std::is_same_v<S, float>)         \
       return PRED_KERNELS(name##_f32);              \
     else if constexpr (std::is_same_v<S, double>)   \

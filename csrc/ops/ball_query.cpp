@@ -27,7 +27,7 @@ std::tuple<Tensor, Tensor> ball_query(const Tensor& points, const Tensor& batch_
     int64_t* index_data = index.mutable_data_ptr<int64_t>();
     int64_t* counts_data = counts.mutable_data_ptr<int64_t>();
     const T squared_radius = T(radius) * T(radius);
-    const BallQueryKernels<T>& kernel = kernels<T>();
+    const BallQueryKernels<T>& kernel = ball_query_kernels<T>();
     in.search<T>([&](const PointTree<T>& tree, int64_t begin, int64_t end) {
       kernel.search(tree, query_data, squared_radius, max_points, index_data, counts_data, begin, end);
     });

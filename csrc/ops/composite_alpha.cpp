@@ -17,7 +17,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_alpha(const Tensor& alpha, 
   return PRED_DISPATCH_STORAGE(op, storage_type(alpha, values), [&] {
     CompositeInputs<CompositeAlphaArgs<S>> in(op, "alpha", alpha, t, values, ray_offsets, depth_mid);
     in.args.eps = eps;
-    return composite(in, kernels<S>(), alpha, nullptr);
+    return composite(in, composite_alpha_kernels<S>(), alpha, nullptr);
   });
 }
 
@@ -29,9 +29,9 @@ std::tuple<Tensor, Tensor, Tensor> composite_alpha_backward(
   return PRED_DISPATCH_STORAGE(op, storage_type(alpha, values, grad_values), [&] {
     CompositeInputs<CompositeAlphaArgs<S>> in(op, "alpha", alpha, t, values, ray_offsets, depth_mid);
     in.args.eps = eps;
-    auto [of_alpha, _, of_t, of_values] =
-        composite_backward(in, kernels<S>(), alpha, {grad_weights, grad_depth, grad_opacity, grad_values},
-                           {nullptr, nullptr}, {need_alpha, false, need_t, need_values});
+    auto [of_alpha, _, of_t, of_values] = composite_backward(
+        in, composite_alpha_kernels<S>(), alpha, {grad_weights, grad_depth, grad_opacity, grad_values},
+        {nullptr, nullptr}, {need_alpha, false, need_t, need_values});
     return std::make_tuple(of_alpha, of_t, of_values);
   });
 }

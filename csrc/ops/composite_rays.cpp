@@ -19,7 +19,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> composite_rays(const Tensor& 
     in.args.inv_s = read_sharpness<T>(op, inv_s, in.dtype);
     in.args.last_opaque = last_opaque;
     Tensor remaining = output_tensor(sdf, true, {in.num_rays}, in.dtype);
-    auto out = composite(in, kernels<S>(), sdf, mutable_storage<T>(remaining));
+    auto out = composite(in, composite_rays_kernels<S>(), sdf, mutable_storage<T>(remaining));
     return std::tuple_cat(out, std::make_tuple(remaining));
   });
 }
@@ -36,7 +36,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_rays_backward(
     in.args.last_opaque = last_opaque;
     const CompositeSaved<T> saved{in.template pointer<T>("weights", weights, in.samples),
                                   in.template pointer<T>("remaining", remaining, {in.num_rays})};
-    return composite_backward(in, kernels<S>(), sdf, {grad_weights, grad_depth, grad_opacity, grad_values}, saved,
+    return composite_backward(in, composite_rays_kernels<S>(), sdf,
+                              {grad_weights, grad_depth, grad_opacity, grad_values}, saved,
                               {need_sdf, need_inv_s, need_t, need_values});
   });
 }

@@ -6,6 +6,7 @@
 #include <torch/csrc/stable/ops.h>
 
 #include <algorithm>
+#include <limits>
 #include <memory>
 #include <optional>
 #include <tuple>
@@ -61,8 +62,6 @@ struct Field {
     PRED_CHECK(parameters_in.size(0) == expected, op, ": parameters must have ", expected, " elements, got ",
                parameters_in.size(0));
     PRED_CHECK(point_range.size() == 6, op, ": point_range must hold 6 numbers, got ", point_range.size());
-    PRED_CHECK(beta > 0, op, ": beta must be positive, got ", beta);
-    PRED_CHECK(sdf_scale > 0, op, ": sdf_scale must be positive, got ", sdf_scale);
 
     map = torch::stable::contiguous(map_in, torch::headeronly::MemoryFormat::ChannelsLast);
     points = torch::stable::contiguous(points_in);
@@ -70,14 +69,14 @@ struct Field {
     stride = field_stride(width);
     read_geometry(point_range);
     args.octaves = octaves;
-    args.beta = T(beta);
-    args.sdf_scale = T(sdf_scale);
+    args.beta = positive("beta", beta);
+    args.sdf_scale = positive("sdf_scale", sdf_scale);
     args.num_hidden = layers - 1;
     args.num_outputs = widths[layers];
     pack_parameters();
   }
 
-  int64_t columns(int64_t layer) const { return kernels<S>().columns(widths[layer]); }
+  int64_t columns(int64_t layer) const { return decode_field_kernels<S>().columns(widths[layer]); }
 
   // Nothing kept has no rows either: torch cannot copy some shapes of no elements.
   std::vector<int64_t> saved_shape(int64_t layers) const {
@@ -98,14 +97,20 @@ struct Field {
   }
 
  private:
+  // Numbers that are divided by: normal ones of T.
+  T positive(const char* name, double value) const {
+    using Limits = std::numeric_limits<T>;
+    PRED_CHECK(value >= Limits::min() && value <= Limits::max(), op, ": ", name, " must lie in [", Limits::min(), ", ",
+               Limits::max(), "], got ", value);
+    return T(value);
+  }
+
   void read_geometry(const std::vector<double>& point_range) {
     args.points = points.const_data_ptr<T>();
     for (int axis = 0; axis < 3; ++axis) {
       args.centre[axis] = T((point_range[axis] + point_range[axis + 3]) / 2);
-      args.half_extent[axis] = T((point_range[axis + 3] - point_range[axis]) / 2);
-      PRED_CHECK(args.half_extent[axis] > 0, op,
-                 ": point_range must have its upper bounds above its lower ones in the ", "dtype of points, got ",
-                 point_range[axis], " and ", point_range[axis + 3]);
+      args.half_extent[axis] =
+          positive("half of the extent of point_range", (point_range[axis + 3] - point_range[axis]) / 2);
     }
     auto& m = args.map;
     m.map = storage<S>(map);
@@ -138,7 +143,7 @@ struct Field {
   }
 
   void pack_parameters() {
-    const FieldKernels<S>& k = kernels<S>();
+    const FieldKernels<S>& k = decode_field_kernels<S>();
     const int64_t layers = args.num_hidden + 1, parts = kFieldParts<S> * widths[0];
     int64_t size = kFieldParts<S> > 1 ? k.packed_size(parts, widths[1]) : 0;
     for (int64_t l = 0; l < layers; ++l) {
@@ -147,11 +152,11 @@ struct Field {
     packed = allocate_array<char>(size * int64_t(sizeof(S)) + (2 * layers + 2) * Arena::kAlignment);
     Arena arena(packed.get());
     const T* data = parameters.const_data_ptr<T>();
-    std::vector<S*> up(layers), down(layers);
-    std::vector<int64_t> from(layers);
+    S *up[kMaxHidden + 1], *down[kMaxHidden + 1];
+    int64_t from[kMaxHidden + 1];
     for (int64_t l = 0, at = 0; l < layers; ++l) {
-      up[l] = arena.template take<S>(k.packed_size(widths[l], widths[l + 1]));
-      down[l] = arena.template take<S>(k.packed_size(widths[l + 1], widths[l]));
+      args.up[l] = up[l] = arena.template take<S>(k.packed_size(widths[l], widths[l + 1]));
+      args.down[l] = down[l] = arena.template take<S>(k.packed_size(widths[l + 1], widths[l]));
       from[l] = at;
       at += widths[l + 1] * (widths[l] + 1);
     }
@@ -172,8 +177,6 @@ struct Field {
     });
     padded.resize(layers + 1);
     for (int64_t l = 0; l < layers; ++l) {
-      args.up[l] = up[l];
-      args.down[l] = down[l];
       const T* bias = data + from[l] + widths[l + 1] * widths[l];
       padded[l].assign(std::max(stride, columns(l + 1)), T(0));
       std::copy(bias, bias + widths[l + 1], padded[l].begin());
@@ -191,8 +194,7 @@ using Outputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
 Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor& parameters,
                      std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
                      double sdf_scale, bool with_gradient, bool keep) {
-  return PRED_DISPATCH_FIELD("decode_field", projected.scalar_type(), [&] {
-    using T = Compute<S>;
+  return PRED_DISPATCH_FACTOR("decode_field", projected.scalar_type(), [&] {
     const Field<S> in("decode_field", projected, points, parameters, widths, point_range, octaves, beta, sdf_scale);
     const int64_t frames = in.batch, count = points.size(1), classes = in.args.num_outputs - 1;
     Tensor sdf = torch::stable::new_empty(in.points, {frames, count});
@@ -209,7 +211,7 @@ Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor
                               keep && with_gradient ? mutable_storage<S>(chain) : nullptr};
     const FieldOutputs<S> out{sdf.mutable_data_ptr<T>(), semantics.mutable_data_ptr<T>(),
                               with_gradient ? gradient.mutable_data_ptr<T>() : nullptr};
-    const FieldKernels<S>& k = kernels<S>();
+    const FieldKernels<S>& k = decode_field_kernels<S>();
     const Blocks tasks = product_tasks(in.num_samples);
     parallel(tasks.count(), 1, [&](int64_t first, int64_t last) {
       const auto scratch = allocate_array<char>(k.scratch_bytes(in.args, false));
@@ -225,8 +227,7 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
     const Tensor& chain, std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
     double sdf_scale, bool need_projected, bool need_points, bool need_parameters) {
   const char* op = "decode_field_backward";
-  return PRED_DISPATCH_FIELD(op, projected.scalar_type(), [&] {
-    using T = Compute<S>;
+  return PRED_DISPATCH_FACTOR(op, projected.scalar_type(), [&] {
     Field<S> in(op, projected, points, parameters, widths, point_range, octaves, beta, sdf_scale);
     const int64_t frames = in.batch, count = points.size(1), classes = in.args.num_outputs - 1;
     std::vector<Tensor> kept;
@@ -267,7 +268,7 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
     const Blocks blocks = product_sums(in.num_samples, block_sums * int64_t(sizeof(T)));
     std::unique_ptr<T[]> sums;
     if (need_parameters) sums = allocate_array<T>(blocks.count() * block_sums);
-    const FieldKernels<S>& k = kernels<S>();
+    const FieldKernels<S>& k = decode_field_kernels<S>();
     parallel(blocks.count(), 1, [&](int64_t first, int64_t last) {
       const auto scratch = allocate_array<char>(k.scratch_bytes(in.args, true));
       for (int64_t block = first; block < last; ++block) {

@@ -28,7 +28,7 @@ void sample_frame(const PointForest<T>& forest, int64_t frame, const T* xyz, int
     largest[level] = allocate_array<T>(forest.num_groups(frame, level) * kTreeFan);
     scratch.largest[level] = largest[level].get();
   }
-  kernels<T>().sample(tree, scratch, xyz, forest.num_leaves(frame), first, num_samples, out);
+  farthest_point_sample_kernels<T>().sample(tree, scratch, xyz, forest.num_leaves(frame), first, num_samples, out);
 }
 
 Tensor farthest_point_sample(const Tensor& points_in, const Tensor& batch_offsets, int64_t num_samples, int64_t start) {

@@ -25,7 +25,7 @@ std::tuple<Tensor, Tensor> knn(const Tensor& points, const Tensor& batch_offsets
     const T* query_data = in.queries.const_data_ptr<T>();
     int64_t* index_data = index.mutable_data_ptr<int64_t>();
     T* distance_data = distance.mutable_data_ptr<T>();
-    const KnnKernels<T>& kernel = kernels<T>();
+    const KnnKernels<T>& kernel = knn_kernels<T>();
     in.search<T>([&](const PointTree<T>& tree, int64_t begin, int64_t end) {
       kernel.search(tree, query_data, k, index_data, distance_data, begin, end);
     });

@@ -39,7 +39,7 @@ struct Projection {
     args.outputs = weight.size(0);
     args.rows = storage<S>(bev);
     cells = bev.size(0) * bev.size(2) * bev.size(3);
-    const ProjectKernels<S>& k = kernels<S>();
+    const ProjectKernels<S>& k = project_bev_kernels<S>();
     const int64_t rows = backward ? args.outputs : args.inputs, columns = backward ? args.inputs : args.outputs;
     const int64_t size = k.packed_size(rows, columns);
     packed = allocate_array<char>(size * int64_t(sizeof(S)) + Arena::kAlignment);
@@ -58,11 +58,11 @@ struct Projection {
 
 Tensor project_bev(const Tensor& bev, const Tensor& weight) {
   const char* op = "project_bev";
-  return PRED_DISPATCH_FIELD(op, bev.scalar_type(), [&] {
+  return PRED_DISPATCH_FACTOR(op, bev.scalar_type(), [&] {
     const Projection<S> in(op, bev, weight, false);
     Tensor out = in.new_map(in.args.outputs);
     S* data = mutable_storage<S>(out);
-    const ProjectKernels<S>& k = kernels<S>();
+    const ProjectKernels<S>& k = project_bev_kernels<S>();
     const Blocks tasks = product_tasks(in.cells);
     parallel(tasks.count(), 1, [&](int64_t first, int64_t last) {
       const auto scratch = allocate_array<char>(k.scratch_bytes(in.args));
@@ -75,14 +75,13 @@ Tensor project_bev(const Tensor& bev, const Tensor& weight) {
 std::tuple<Tensor, Tensor> project_bev_backward(const Tensor& grad_in, const Tensor& bev, const Tensor& weight,
                                                 bool need_bev, bool need_weight) {
   const char* op = "project_bev_backward";
-  return PRED_DISPATCH_FIELD(op, bev.scalar_type(), [&] {
-    using T = Compute<S>;
+  return PRED_DISPATCH_FACTOR(op, bev.scalar_type(), [&] {
     Projection<S> in(op, bev, weight, true);
     check_cpu_tensor(op, "grad", grad_in, 4, bev.scalar_type());
     check_sizes(op, "grad", grad_in, {bev.size(0), weight.size(0), bev.size(2), bev.size(3)});
     const Tensor grad = torch::stable::contiguous(grad_in, MemoryFormat::ChannelsLast);
     in.args.grad = storage<S>(grad);
-    const ProjectKernels<S>& k = kernels<S>();
+    const ProjectKernels<S>& k = project_bev_kernels<S>();
     Tensor out_bev = need_bev ? in.new_map(in.args.inputs) : torch::stable::new_empty(in.bev, {0});
     Tensor out_weight = torch::stable::new_empty(in.weight, {need_weight ? in.args.outputs : 0, in.args.inputs});
     const int64_t columns = k.columns(in.args.inputs), sums_size = in.args.outputs * columns;

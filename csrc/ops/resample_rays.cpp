@@ -10,7 +10,7 @@ PRED_KERNELS_BY_TYPE(SamplePdfKernels, resample_rays)
 Tensor resample_rays(const Tensor& t, const Tensor& weights, const Tensor& u, const std::string& mode,
                      double histogram_padding, double eps, double min_width) {
   return PRED_DISPATCH_FLOAT("resample_rays", t.scalar_type(), [&] {
-    return sample_sections<T>("resample_rays", "t", true, kernels<T>(), t, weights, u,
+    return sample_sections<T>("resample_rays", "t", true, resample_rays_kernels<T>(), t, weights, u,
                               {mode, histogram_padding, eps, min_width});
   });
 }

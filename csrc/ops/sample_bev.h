@@ -7,20 +7,15 @@
 namespace pred {
 namespace {
 
+PRED_KERNELS_BY_STORAGE(SampleBevKernels, sample_bev)
+
 struct Bev {
   static constexpr int kAxes = 2;
   static constexpr const char* kName = "sample_bev";
   static constexpr const char* kMap = "bev";
   template <typename S>
   static const SampleBevKernels<S>& table() {
-    if constexpr (std::is_same_v<S, float>)
-      return PRED_KERNELS(sample_bev_f32);
-    else if constexpr (std::is_same_v<S, double>)
-      return PRED_KERNELS(sample_bev_f64);
-    else if constexpr (std::is_same_v<S, BFloat16>)
-      return PRED_KERNELS(sample_bev_bf16);
-    else
-      return PRED_KERNELS(sample_bev_f16);
+    return sample_bev_kernels<S>();
   }
 };
 using SampleBev = SampleGrid<Bev>;

@@ -194,8 +194,8 @@ struct SampleGrid {
     const int64_t batch = map.size(0), num_samples = batch * a.num_samples;
     const auto& k = Op::template table<S>();
     if (map.numel() == 0) return new_channels_last(map);  // whatever its other sizes are
-    PRED_CHECK(num_samples < int64_t(1) << 31, op, ": grid must have fewer than 2^31 samples where the gradient of ",
-               Op::kMap, " is wanted, got ", num_samples);
+    PRED_CHECK(num_samples < int64_t(1) << 31, op,
+               ": samples must be fewer than 2^31 where the gradient of the map is wanted, got ", num_samples);
     SampleGridOrder order{nullptr, bits_for(num_samples), {}};
     int cell_bits = 0;
     for (int axis = 0; axis < kAxes; ++axis) {
@@ -203,8 +203,8 @@ struct SampleGrid {
       cell_bits += order.size_bits[axis];
     }
     const int key_bits = bits_for(batch) + cell_bits;
-    PRED_CHECK(key_bits + order.number_bits < 64, op, ": ", Op::kMap,
-               " must have fewer than 2^64 cells times samples, both rounded up to powers of 2, got 2^",
+    PRED_CHECK(key_bits + order.number_bits < 64, op,
+               ": cells times samples of the map, both rounded up to powers of 2, must be fewer than 2^64, got 2^",
                key_bits + order.number_bits);
     const auto sorted = sort_rows<uint64_t>(
         num_samples, order.number_bits, key_bits,

@@ -10,7 +10,7 @@ PRED_KERNELS_BY_TYPE(SamplePdfKernels, sample_pdf)
 Tensor sample_pdf(const Tensor& edges, const Tensor& weights, const Tensor& u, const std::string& mode,
                   double histogram_padding, double eps, double min_width) {
   return PRED_DISPATCH_FLOAT("sample_pdf", edges.scalar_type(), [&] {
-    return sample_sections<T>("sample_pdf", "edges", false, kernels<T>(), edges, weights, u,
+    return sample_sections<T>("sample_pdf", "edges", false, sample_pdf_kernels<T>(), edges, weights, u,
                               {mode, histogram_padding, eps, min_width});
   });
 }

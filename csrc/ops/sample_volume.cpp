@@ -13,7 +13,7 @@ struct Volume {
   static constexpr const char* kMap = "volume";
   template <typename S>
   static const SampleVolumeKernels<S>& table() {
-    return kernels<S>();
+    return sample_volume_kernels<S>();
   }
 };
 using SampleVolume = SampleGrid<Volume>;

@@ -70,7 +70,7 @@ Tensor sdf_to_alpha(const Tensor& sdf, const Tensor& inv_s, bool last_opaque, st
     const Rays<T> rays("sdf_to_alpha", sdf, inv_s, last_opaque, ray_offsets);
     Tensor alpha = torch::stable::empty_like(rays.sdf);
     T* out = alpha.mutable_data_ptr<T>();
-    const auto& k = kernels<T>();
+    const auto& k = sdf_to_alpha_kernels<T>();
     parallel(rays.num_groups(), kGrain / kGroup, [&](int64_t first, int64_t last) {
       rays.for_groups(first, last, [&](int64_t, int64_t begin, int64_t end) { k.pair(rays.args, out, begin, end); });
     });
@@ -111,7 +111,7 @@ std::tuple<Tensor, Tensor> sdf_to_alpha_backward(const Tensor& grad_in, const Te
     Tensor grad_sdf = output(rays.sdf, need_sdf);
     T* out = data<T>(grad_sdf, need_sdf);
     std::vector<double> parts(need_inv_s ? rays.num_groups() : 0);
-    const auto& k = kernels<T>();
+    const auto& k = sdf_to_alpha_kernels<T>();
     parallel(rays.num_groups(), kGrain / kGroup, [&](int64_t first, int64_t last) {
       std::vector<T> scratch(3 * rays.largest_group);
       rays.for_groups(first, last, [&](int64_t group, int64_t begin, int64_t end) {
@@ -150,7 +150,7 @@ Tensor sdf_to_alpha_section(const Tensor& sdf, const Tensor& inv_s, const Tensor
     Tensor alpha = torch::stable::empty_like(in.sdf);
     T* out = alpha.mutable_data_ptr<T>();
     const int64_t count = in.sdf.numel();
-    const auto& k = kernels<T>();
+    const auto& k = sdf_to_alpha_kernels<T>();
     // Whole groups, so that a sample's place in its vector does not depend on the number of threads.
     parallel((count + kGroup - 1) / kGroup, kGrain / kGroup, [&](int64_t first, int64_t last) {
       k.section(in.args, out, first * kGroup, std::min(last * kGroup, count));
@@ -172,7 +172,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> sdf_to_alpha_section_backward(
                                        data<T>(grad_length, need_length)};
     const int64_t count = in.sdf.numel(), groups = (count + kGroup - 1) / kGroup;
     std::vector<double> parts(groups);
-    const auto& k = kernels<T>();
+    const auto& k = sdf_to_alpha_kernels<T>();
     parallel(groups, kGrain / kGroup, [&](int64_t first, int64_t last) {
       for (int64_t group = first; group < last; ++group) {
         parts[group] = k.section_backward(in.args, grad.const_data_ptr<T>(), out, group * kGroup,
@@ -192,7 +192,7 @@ Tensor sdf_to_alpha_density(const Tensor& density_in, const Tensor& length_in) {
     Tensor alpha = torch::stable::empty_like(density);
     T* out = alpha.mutable_data_ptr<T>();
     const int64_t count = density.numel();
-    const auto& k = kernels<T>();
+    const auto& k = sdf_to_alpha_kernels<T>();
     parallel((count + kGroup - 1) / kGroup, kGrain / kGroup,
              [&](int64_t first, int64_t last) { k.density(a, out, first * kGroup, std::min(last * kGroup, count)); });
     return alpha;
@@ -210,7 +210,7 @@ std::tuple<Tensor, Tensor> sdf_to_alpha_density_backward(const Tensor& grad_in, 
     Tensor grad_density = output(density, need_density), grad_length = output(density, need_length);
     T *density_out = data<T>(grad_density, need_density), *length_out = data<T>(grad_length, need_length);
     const int64_t count = density.numel();
-    const auto& k = kernels<T>();
+    const auto& k = sdf_to_alpha_kernels<T>();
     parallel((count + kGroup - 1) / kGroup, kGrain / kGroup, [&](int64_t first, int64_t last) {
       k.density_backward(a, grad.const_data_ptr<T>(), density_out, length_out, first * kGroup,
                          std::min(last * kGroup, count));

@@ -32,7 +32,7 @@ int64_t row_grain(int64_t channels) { return 1 + 16384 / (channels + 4); }
 // `index` lies in [-1, num_segments); the message names the first row for which it does not.
 void check_index(const char* op, const Tensor& index, int64_t num_segments) {
   const int64_t* data = index.const_data_ptr<int64_t>();
-  const auto& k = kernels<float>();
+  const auto& k = segment_reduce_kernels<float>();
   std::atomic<bool> valid{true};
   parallel(index.size(0), 32768, [&](int64_t begin, int64_t end) {
     if (!k.is_valid(data, num_segments, begin, end)) valid = false;
@@ -47,7 +47,7 @@ template <typename S>
 std::tuple<Tensor, Tensor> forward(const char* op, const Tensor& features_in, const Tensor& index_in,
                                    int64_t num_segments, SegmentReduction how) {
   using T = Compute<S>;
-  const SegmentReduceKernels<S>& k = kernels<S>();
+  const SegmentReduceKernels<S>& k = segment_reduce_kernels<S>();
   const Tensor features = torch::stable::contiguous(features_in), index = torch::stable::contiguous(index_in);
   const int64_t num_rows = features.size(0), channels = features.size(1);
   check_index(op, index, num_segments);
@@ -109,7 +109,7 @@ Tensor segment_reduce_backward(const Tensor& grad_in, const Tensor& index_in, co
     const int64_t* index_data = index.const_data_ptr<int64_t>();
     const int32_t* saved_data = saved.const_data_ptr<int32_t>();
     S* out_data = mutable_storage<S>(out);
-    const auto& k = kernels<S>();
+    const auto& k = segment_reduce_kernels<S>();
     parallel(num_rows, row_grain(channels), [&](int64_t begin, int64_t end) {
       k.backward[int(how)](grad_data, channels, index_data, saved_data, out_data, begin, end);
     });

@@ -23,7 +23,7 @@ template <typename S>
 using Moved = std::conditional_t<sizeof(S) == 2, uint16_t, S>;
 
 template <typename M, typename Item>
-const VoxelizeHardKernels<M, Item>& kernels() {
+const VoxelizeHardKernels<M, Item>& voxelize_hard_kernels() {
   constexpr bool wide = !std::is_same_v<Item, uint64_t>;
   if constexpr (std::is_same_v<M, float>)
     if constexpr (wide)
@@ -74,7 +74,7 @@ int64_t number_voxels(std::vector<Piece>& pieces, int64_t max_voxels) {
 template <typename M, typename Item>
 Outputs fill_voxels(const VoxelizeInputs& in, const Tensor& points, const SortedItems<Item>& sorted,
                     const Tensor& point_to_slot, int64_t max_points, int64_t max_voxels) {
-  const VoxelizeHardKernels<M, Item>& k = kernels<M, Item>();
+  const VoxelizeHardKernels<M, Item>& k = voxelize_hard_kernels<M, Item>();
   const int64_t num_points = in.num_points(), columns = points.size(1);
   int64_t voxel_elements;
   PRED_CHECK(!__builtin_mul_overflow(max_points, columns, &voxel_elements),
@@ -152,7 +152,7 @@ Tensor voxelize_hard_backward(const Tensor& grad_in, const Tensor& point_to_slot
     using M = Moved<S>;
     Tensor out = torch::stable::new_empty(grad, {num_points, columns});
     M* data = mutable_storage<M>(out);
-    const auto& k = kernels<M, uint64_t>();
+    const auto& k = voxelize_hard_kernels<M, uint64_t>();
     parallel(num_points, 1 + 16384 / std::max<int64_t>(columns, 1),
              [&](int64_t begin, int64_t end) { k.backward(storage<M>(grad), columns, slot_of, data, begin, end); });
     return out;

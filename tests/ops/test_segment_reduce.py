@@ -210,7 +210,7 @@ def test_direct_calls_are_checked(native: None) -> None:
     backward = torch.ops.pred.segment_reduce_backward
     with pytest.raises(KERNEL_ERROR, match=r"segment_reduce: index must have shape \[40\], got \[3\]"):
         torch.ops.pred.segment_reduce(features, index[:3], 12, "sum")
-    with pytest.raises(KERNEL_ERROR, match="segment_reduce: dtype must be float32, float64, bfloat16 or float16"):
+    with pytest.raises(KERNEL_ERROR, match="dtype must be float32, float64, bfloat16 or float16, got Long"):
         torch.ops.pred.segment_reduce(features.long(), index, 12, "sum")
     with pytest.raises(KERNEL_ERROR, match=r"index must lie in \[-1, num_segments=11\)"):
         backward(features[:11], torch.full((4,), 11), torch.empty(0, dtype=torch.int32), "sum")
