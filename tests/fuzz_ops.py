@@ -45,7 +45,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.symbolic_shapes import ShapeEnv
 
 from pred import _native
-from tests.ops.examples import EXAMPLES, Example, Source, outputs, recorded_calls
+from tests.ops.examples import EXAMPLES, LOW_PRECISION, Example, Source, outputs, recorded_calls
 
 SEEDS_PER_RUN = 10**9
 SECONDS_PER_CALL = 60
@@ -312,7 +312,7 @@ class Fuzzer:
         with backend("native"):
             self.direct = recorded_calls()
         self.direct["parallel_probe"] = [(torch.zeros(8, dtype=torch.int64), 1, -1)]
-        self.targets: list[Example | str] = [*EXAMPLES, *sorted(self.direct)]
+        self.targets: list[Example | str] = [*EXAMPLES, *LOW_PRECISION, *sorted(self.direct)]
 
     def run(self, seed: int) -> str:
         """What came of it: ``result``, or the name of the exception."""

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -270,13 +269,16 @@ def _arguments(
         check_like(OP, f"biases[{i}]", bias, "points", points)
     if weights[-1].shape[0] == 0:
         raise ValueError(f"{OP}: weights[{len(weights) - 1}] must have at least one row, got 0")
+    numbers = torch.finfo(points.dtype)
     for name, value in (("softplus_beta", softplus_beta), ("sdf_scale", sdf_scale)):
         check_number(OP, name, value)
-        if not 0 < value < math.inf:
-            raise ValueError(f"{OP}: {name} must be positive and finite, got {value}")
+        if not numbers.tiny <= value <= numbers.max:
+            raise ValueError(f"{OP}: {name} must be positive, finite and normal in {points.dtype}, got {value}")
     box = check_floats(OP, "point_range", point_range, 6)
     if not all(low < high for low, high in zip(box, box[3:], strict=False)):
         raise ValueError(f"{OP}: point_range must be x, y, z of the lower, then of the upper corner, got {box}")
+    if not all(numbers.tiny <= (high - low) / 2 <= numbers.max for low, high in zip(box, box[3:], strict=False)):
+        raise ValueError(f"{OP}: point_range must have extents that are finite and normal in {points.dtype}, got {box}")
     return points, weights, biases, _Settings(tuple(box), frequencies, float(softplus_beta), float(sdf_scale))
 
 

@@ -497,10 +497,17 @@ class Recorder(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
+LOW_PRECISION = _examples(
+    "decode_field", _decode_field, *({"precision": "bf16", "with_gradient": keep} for keep in (True, False)), **_FIELD
+)
+"""Calls that only float32 takes and whose rounding is another: recorded and made at random; their values have tests of
+their own."""
+
+
 def recorded_calls() -> dict[str, list[tuple[Any, ...]]]:
     """Calls of every ``torch.ops.pred`` op that the examples and their derivatives make."""
     recorder = Recorder()
-    for example in EXAMPLES:
+    for example in [*EXAMPLES, *LOW_PRECISION]:
         for count in (0, 5):
             for dtype in (torch.float32, *(HALF[:1] if example.features else ())):
                 arguments = example.example(count, dtype)

@@ -390,8 +390,16 @@ def test_errors(backend: str) -> None:
         call(weights=weights[:1], biases=biases[:1])
     with pytest.raises(TypeError, match=r"decode_field: biases\[2\] must have the dtype of points"):
         call(biases=[*biases[:2], biases[2].float()])
-    with pytest.raises(ValueError, match="decode_field: softplus_beta must be positive and finite, got 0"):
+    with pytest.raises(
+        ValueError, match="decode_field: softplus_beta must be positive, finite and normal in torch.float64"
+    ):
         call(softplus_beta=0)
+    single = make().to(torch.float32)
+    for name in ("softplus_beta", "sdf_scale"):
+        with pytest.raises(ValueError, match=f"{name} must be positive, finite and normal in torch.float32, got 1e-40"):
+            single.call(**{name: 1e-40})
+    with pytest.raises(ValueError, match="point_range must have extents that are finite and normal in torch.float32"):
+        decode_field(*single[:4], (0.0,) * 3 + (1e-40,) * 3, **single.settings)
     with pytest.raises(ValueError, match="decode_field: precision must be one of fp32, bf16, got 'fp16'"):
         call(precision="fp16")
     with pytest.raises(TypeError, match="decode_field: precision must be 'fp32' where points is torch.float64"):
@@ -415,6 +423,10 @@ def test_direct_calls_are_checked(native: None) -> None:
         call(bev, points, parameters[1:], *settings, True, True)
     with pytest.raises(KERNEL_ERROR, match="decode_field: widths must start with 3 \\+ 6 octaves"):
         call(bev, points, parameters, [9, 16, 1], *settings[1:], True, True)
+    with pytest.raises(KERNEL_ERROR, match="decode_field: beta must lie in .*, got 1e-40"):
+        call(bev, points, parameters, *settings[:3], 1e-40, 1.0, True, True)
+    with pytest.raises(KERNEL_ERROR, match="decode_field: dtype must be float32, float64 or bfloat16, got Half"):
+        call(bev.half(), points, parameters, *settings, True, True)
     with pytest.raises(KERNEL_ERROR, match=r"decode_field_backward: grad_sdf must have shape \[1, 5\], got \[1, 4\]"):
         torch.ops.pred.decode_field_backward(
             points[:, 1:, 0], None, None, bev, points, parameters, *[torch.zeros(0, 0, 0)] * 2, *settings,
