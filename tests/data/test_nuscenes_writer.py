@@ -449,7 +449,6 @@ def test_mini_names_and_lidarseg_evaluation(tmp_path: Path) -> None:
 
 def die_at_replacement(out: Path, settings: WorldSettings, number: int) -> None:
     """Make a world, but end without warning at the ``number``-th replacement of a file: before it if even."""
-    os.setsid()
     replace, count = os.replace, 0
 
     def counted(*arguments: Any) -> None:
