@@ -27,7 +27,7 @@ from pred.data.world.nuscenes_writer import (
     ATTRIBUTES,
     CATEGORIES,
     LOCATIONS,
-    MAX_TOWN_M,
+    REGION_M,
     MINI_SCENES,
     MINI_VAL,
     REGIONS,
@@ -160,12 +160,12 @@ def test_sweep_images(tmp_path: Path) -> None:
 
 
 def test_regions_lie_inside_the_official_maps_and_apart() -> None:
-    assert len(set(REGIONS)) == len(REGIONS) == 171
+    assert len(set(REGIONS)) == len(REGIONS) == 108
     for region in REGIONS:
         location = LOCATIONS[region.location]
-        assert 0 <= region.x_m <= location.width_m - MAX_TOWN_M
-        assert 0 <= region.y_m <= location.height_m - MAX_TOWN_M
-        assert region.x_m % MAX_TOWN_M == region.y_m % MAX_TOWN_M == 0
+        assert 0 <= region.x_m <= location.width_m - REGION_M
+        assert 0 <= region.y_m <= location.height_m - REGION_M
+        assert region.x_m % REGION_M == region.y_m % REGION_M == 0
 
 
 def test_tokens_are_a_function_of_their_key() -> None:
@@ -321,7 +321,7 @@ def test_maps(root: Path, devkit: Any) -> None:
         pose = devkit.get("ego_pose", sample["data"]["LIDAR_TOP"])
         x, y = pose["translation"][:2]
         # The town reaches from (-60, -60) to (120, 60) in coordinates in which the drive starts at the origin.
-        np.testing.assert_allclose([x, y], [MAX_TOWN_M / 2 - 30, MAX_TOWN_M / 2], atol=1e-9)
+        np.testing.assert_allclose([x, y], [REGION_M / 2 - 30, REGION_M / 2], atol=1e-9)
         mask = devkit.get("map", log["map_token"])["mask"]
         places = np.array([[0, 0], [59.5, 59.5], [100, 9.5], [100, 10.5], [60.5, 20], [-59.5, -59.5], [-60.5, 0]])
         inside = mask.is_on_mask(*(places + [x, y]).T)
@@ -597,8 +597,8 @@ def test_large_town_is_refused(tmp_path: Path) -> None:
 
 
 def test_settings_out_of_range() -> None:
-    with pytest.raises(ValueError, match=r"scenes must be in \[1, 171\].*got 172; more scenes: a second world"):
-        WorldSettings(scenes=172)
+    with pytest.raises(ValueError, match=r"scenes must be in \[1, 108\].*got 109; more scenes: a second world"):
+        WorldSettings(scenes=109)
     with pytest.raises(ValueError, match="keyframes must be at least 1, got 0"):
         WorldSettings(scenes=1, keyframes=0)
     with pytest.raises(ValueError, match=r"image_scale must be in \[0\.02, 1\], got nan"):
@@ -626,7 +626,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.
         "exact_labels": True, "out": tmp_path,
     }  # fmt: skip
     assert cli.main(["world", "make", str(tmp_path), "--scenes", "0"]) == 1
-    assert "scenes must be in [1, 171]" in capfd.readouterr().err
+    assert "scenes must be in [1, 108]" in capfd.readouterr().err
 
 
 def test_summary(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

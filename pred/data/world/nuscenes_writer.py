@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 OFFICIAL_IMAGE_SIZE = (1600, 900)
 JPEG_QUALITY = 90
 MAX_TOWN_M = 400.0
-"""Side of the square of map that each scene has to itself."""
+REGION_M = 475.0
+"""Side of the square of map that each scene has to itself. Towns keep 75 m apart: a BEV grid of 100 m x 100 m around a car
+at the rim of one, whatever its heading, shows nothing of the next."""
 MAP_PIXELS_PER_M = 10
 
 CATEGORIES = (
@@ -191,16 +193,16 @@ class Region(NamedTuple):
     def offset(self, town: dict[str, Any]) -> NDArray[np.float64]:
         """[3] translation from the town's coordinates to the map's: centre to centre."""
         low, high = _extent(town)
-        return np.append(np.array([self.x_m, self.y_m]) + MAX_TOWN_M / 2 - (low + high) / 2, 0.0)
+        return np.append(np.array([self.x_m, self.y_m]) + REGION_M / 2 - (low + high) / 2, 0.0)
 
 
 def _regions() -> list[Region]:
     """All squares in the order of the scenes: the locations take turns, each is filled from its south-west corner."""
     squares = {}
     for name, location in LOCATIONS.items():
-        columns, rows = int(location.width_m // MAX_TOWN_M), int(location.height_m // MAX_TOWN_M)
+        columns, rows = int(location.width_m // REGION_M), int(location.height_m // REGION_M)
         squares[name] = [
-            Region(name, column * MAX_TOWN_M, row * MAX_TOWN_M) for row in range(rows) for column in range(columns)
+            Region(name, column * REGION_M, row * REGION_M) for row in range(rows) for column in range(columns)
         ]
     turns = max(map(len, squares.values()))
     return [of_location[turn] for turn in range(turns) for of_location in squares.values() if turn < len(of_location)]
