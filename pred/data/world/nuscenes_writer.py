@@ -37,8 +37,8 @@ OFFICIAL_IMAGE_SIZE = (1600, 900)
 JPEG_QUALITY = 90
 MAX_TOWN_M = 400.0
 REGION_M = 475.0
-"""Side of the square of map that each scene has to itself. Towns keep 75 m apart: a BEV grid of 100 m x 100 m around a car
-at the rim of one, whatever its heading, shows nothing of the next."""
+"""Side of the square of map that each scene has to itself. Towns keep 75 m apart: a BEV grid of 100 m x 100 m around a
+car at the rim of one, whatever its heading, shows nothing of the next."""
 MAP_PIXELS_PER_M = 10
 
 CATEGORIES = (
@@ -231,33 +231,33 @@ def write_keyframe(root: Path, settings: WorldSettings, drive: Drive, scene: int
         ValueError: the town is larger than `MAX_TOWN_M`.
     """
     keyframe_us = int(drive.keyframe_us[keyframe])
+    sweeps_us = [int(time_us) for time_us in drive.sweep_us(keyframe)]
     files = _Files(root, settings, drive, scene)
-    for time_us in map(int, drive.sweep_us(keyframe)):
+    for time_us in sweeps_us:
         sweep = drive.scan(time_us)
-        is_keyframe = time_us == keyframe_us
-        path = files.add(LIDAR_CHANNEL, time_us, is_keyframe)
+        path = files.add(LIDAR_CHANNEL, time_us, is_keyframe=time_us == keyframe_us)
         files.write(path, sweep.points.astype("<f4", copy=False).tobytes())
-        if is_keyframe:
+        if time_us == keyframe_us:
             points = sweep.points[:, :3].astype(np.float64)
             token = _data_token(settings, scene, LIDAR_CHANNEL, time_us)
             files.write(_lidarseg_file(settings, token), sweep.category.astype(np.uint8, copy=False).tobytes())
-    views = []
-    for time_us in map(int, drive.sweep_us(keyframe)):
-        is_keyframe = time_us == keyframe_us
-        if not (is_keyframe or settings.sweep_images):
-            continue
+    pictures = []
+    for time_us in sweeps_us if settings.sweep_images else [keyframe_us]:
         for mount in MOUNTS:
             camera_us = time_us + drive.camera_offsets_us[mount.name]
             view = drive.view(mount, camera_us, *settings.image_size)
-            path = files.add(mount.name, camera_us, is_keyframe)
+            path = files.add(mount.name, camera_us, is_keyframe=time_us == keyframe_us)
             files.write_image(path, view.image, format="JPEG", quality=JPEG_QUALITY)
-            if is_keyframe:
-                views.append((view, *_placed_camera(settings, drive, mount, camera_us), camera_us))
-                if settings.exact_labels:
-                    label = Path("pseudo") / "exact" / mount.name / f"{Path(path).stem}.png"
-                    files.write_image(str(label), view.class_id, format="PNG")
+            if time_us != keyframe_us:
+                continue
+            if settings.exact_labels:
+                files.write_image(f"pseudo/exact/{mount.name}/{Path(path).stem}.png", view.class_id, format="PNG")
+            camera = mounted_camera(mount, *settings.image_size)
+            T_world_from_lidar = drive.T_world_from_ego(camera_us) @ T_EGO_FROM_LIDAR
+            T_camera_from_world = camera.T_camera_from_lidar @ invert_rigid(T_world_from_lidar)
+            pictures.append(_Picture(view, camera, T_camera_from_world, camera_us))
     num_points = _count_points(points, drive, keyframe_us)
-    shares = _visible_shares(views, drive.actors)
+    shares = _visible_shares(pictures, drive.actors)
     part = {
         "time_us": keyframe_us,
         "data": files.data,
@@ -270,6 +270,13 @@ def write_keyframe(root: Path, settings: WorldSettings, drive: Drive, scene: int
     if keyframe == 0:
         part["town"] = _town_part(drive.town)
     return part
+
+
+class _Picture(NamedTuple):
+    view: View
+    camera: Camera
+    T_camera_from_world: NDArray[np.float64]
+    time_us: int
 
 
 class _Files:
@@ -312,15 +319,6 @@ class _Files:
         return path
 
 
-def _placed_camera(
-    settings: WorldSettings, drive: Drive, mount: Any, time_us: int
-) -> tuple[Camera, NDArray[np.float64]]:
-    """Camera of a mount and its T_camera_from_world."""
-    camera = mounted_camera(mount, *settings.image_size)
-    T_world_from_lidar = drive.T_world_from_ego(time_us) @ T_EGO_FROM_LIDAR
-    return camera, camera.T_camera_from_lidar @ invert_rigid(T_world_from_lidar)
-
-
 def _actor_part(actor: Actor, time_us: int, num_points: int, visible_share: float) -> Row:
     attribute = actor.attribute(time_us)
     if actor.category not in CATEGORIES or (attribute and attribute not in ATTRIBUTES):
@@ -352,20 +350,19 @@ def _count_points(points: NDArray[np.float64], drive: Drive, time_us: int) -> li
     return counts
 
 
-def _visible_shares(
-    views: Sequence[tuple[View, Camera, NDArray[np.float64], int]], actors: Sequence[Actor]
-) -> list[float]:
+def _visible_shares(pictures: Sequence[_Picture], actors: Sequence[Actor]) -> list[float]:
     """Share of each actor's pixels, over all pictures, that shows the actor: own / (own + hidden).
 
     Hidden are those pixels inside the outline of its box that show something nearer than the box. What lies outside the
     pictures does not count; an actor in no picture has share 0.
     """
     own, hidden = np.zeros(len(actors)), np.zeros(len(actors))
-    for view, camera, T_camera_from_world, time_us in views:
-        shown = np.bincount(view.instance.ravel(), minlength=1 + max((actor.instance for actor in actors), default=0))
+    largest = max((actor.instance for actor in actors), default=0)
+    for picture in pictures:
+        shown = np.bincount(picture.view.instance.ravel(), minlength=1 + largest)
         for number, actor in enumerate(actors):
             own[number] += shown[actor.instance]
-            hidden[number] += _hidden_pixels(view, camera, T_camera_from_world @ actor.pose(time_us), actor)
+            hidden[number] += _hidden_pixels(picture, actor)
     shares: list[float] = (own / np.maximum(own + hidden, 1)).tolist()
     return shares
 
@@ -374,8 +371,10 @@ _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z i
 _FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 
 
-def _hidden_pixels(view: View, camera: Camera, T_camera_from_box: NDArray[np.float64], actor: Actor) -> int:
+def _hidden_pixels(picture: _Picture, actor: Actor) -> int:
     """Pixels inside the outline of a box that show something nearer. Boxes that reach behind the camera have none."""
+    view, camera = picture.view, picture.camera
+    T_camera_from_box = picture.T_camera_from_world @ actor.pose(picture.time_us)
     corners = transform_points(T_camera_from_box, _CORNERS * actor.size_lwh_m)
     if corners[:, 2].min() < MIN_PROJECTION_DEPTH_M:
         return 0
