@@ -136,8 +136,17 @@ class FakeDrive:
         )
         self.actors = tuple(actors)
 
-    def _actor(self, instance: int, category: str, size: tuple[float, float, float], *rest: Any) -> FakeActor:
-        return FakeActor(instance, category, size, *rest, start_us=self.start_us)
+    def _actor(
+        self,
+        instance: int,
+        category: str,
+        size_lwh_m: tuple[float, float, float],
+        place_m: tuple[float, float],
+        yaw_rad: float,
+        speed: float,
+        name: str,
+    ) -> FakeActor:
+        return FakeActor(instance, category, size_lwh_m, place_m, yaw_rad, speed, name, self.start_us)
 
     def sweep_us(self, k: int) -> NDArray[np.int64]:
         first = -10 if k == 0 else -9
@@ -237,7 +246,7 @@ class LargeTownDrive(FakeDrive):
 class MisnamedDrive(FakeDrive):
     def __init__(self, seed: int, index: int, keyframes: int = 40) -> None:
         super().__init__(seed, index, keyframes)
-        self.actors = (self._actor(1, "vehicle.tank", (1.0, 1.0, 1.0), (9.0, 0.0), 0.0, 0.0, ""),)
+        self.actors = (self._actor(1, "vehicle.car", (4.0, 2.0, 1.5), (9.0, 0.0), 0.0, 0.0, "vehicle.flying"),)
 
 
 def _yaw_pose(yaw: float, x: float, y: float) -> NDArray[np.float64]:

@@ -338,10 +338,17 @@ def test_maps(root: Path, devkit: Any) -> None:
             "stop_line": 10,
             "carpark_area": 20 * 20,
         }
+        for layer, area in layers.items():
+            key = "polygon_tokens" if layer == "drivable_area" else "polygon_token"
+            tokens = np.ravel([record[key] for record in getattr(town, layer)])
+            polygons = [town.extract_polygon(token) for token in tokens]
+            assert sum(polygon.area for polygon in polygons) == pytest.approx(area), layer
+            assert all(polygon.exterior.is_ccw for polygon in polygons)
         patch = (x + 30, y, 120, 180)
-        masks = town.get_map_mask(patch, 0, list(layers), (480, 720))
-        for layer, area, found in zip(layers, layers.values(), masks.sum(axis=(1, 2)) / 16, strict=True):
-            assert found == pytest.approx(area, rel=0.05, abs=4), layer
+        masks = town.get_map_mask(patch, 0, list(layers), (1200, 1800))
+        for layer, area, found in zip(layers, layers.values(), masks.sum(axis=(1, 2)) / 100, strict=True):
+            # The devkit counts the pixels on both rims of a polygon.
+            assert area <= found <= 1.15 * area, layer
         dividers = town.get_map_mask(patch, 0, ["road_divider", "lane_divider"], (480, 720))
         assert (dividers.sum(axis=(1, 2)) > 200).all()
         assert town.layers_on_point(x + 62, y - 2)["ped_crossing"] != ""
@@ -438,9 +445,12 @@ def test_mini_names_and_lidarseg_evaluation(tmp_path: Path) -> None:
             labels = np.fromfile(tmp_path / "world" / record["filename"], np.uint8)
             points = devkit.get("sample_data", record["sample_data_token"])["filename"]
             assert len(labels) * 20 == (tmp_path / "world" / points).stat().st_size
-            mapper.convert_label(labels).astype(np.uint8).tofile(folder / f"{record['sample_data_token']}_lidarseg.bin")
+            # Predictions have no class 0; points of this class do not count.
+            predicted = mapper.convert_label(labels).clip(1).astype(np.uint8)
+            predicted.tofile(folder / f"{record['sample_data_token']}_lidarseg.bin")
         found = official.LidarSegEval(devkit, str(tmp_path / "results"), split).evaluate()
-        assert found["miou"] == 1.0 and not any(np.isnan(list(found["iou_per_class"].values())))
+        assert found["miou"] == 1.0
+        assert [name for name, iou in found["iou_per_class"].items() if np.isnan(iou)] == ["ignore"]
         assert len(NuScenesFrames(tmp_path / "world", split=split)) == (8 if split == "mini_train" else 2)
 
 
@@ -472,7 +482,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return tree(folder)
 
 
-@pytest.mark.parametrize("numbers", [(1, 2, 3, 40, 20, 17, 5, 33), (97, 15, 4, 8, 12, 1, 2, 16)])
+@pytest.mark.parametrize("numbers", [(1, 2, 3, 40, 20, 17, 5, 33), (94, 15, 4, 8, 12, 1, 2, 16)])
 def test_killed_at_any_file(small: dict[str, str], tmp_path: Path, numbers: tuple[int, ...]) -> None:
     out = tmp_path / "world"
     context = multiprocessing.get_context("fork")
