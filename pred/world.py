@@ -17,6 +17,7 @@ import json
 import multiprocessing
 import os
 import shutil
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -82,18 +83,7 @@ def make_world(
     for leftover in out.rglob(f".*{TEMPORARY_SUFFIX}"):
         if leftover.is_file():
             leftover.unlink()
-    num_bytes = 0
-
-    def scenes() -> Iterator[list[Part]]:
-        nonlocal num_bytes
-        for scene in range(settings.scenes):
-            of_scene = [
-                json.loads(_part_file(parts, scene, number).read_text()) for number in range(settings.keyframes)
-            ]
-            num_bytes += sum(part["bytes"] for part in of_scene)
-            yield of_scene
-
-    write_dataset(out, settings, scenes())
+    num_bytes = write_dataset(out, settings, _read_parts(parts, settings))
     shutil.rmtree(parts)
     rate_text = f"{len(missing)} made in {format_duration(elapsed_s)}, {len(missing) / elapsed_s:.2f} keyframes/s"
     print(
@@ -116,6 +106,12 @@ def _make_keyframe(out: Path, settings: WorldSettings, make_drive: MakeDrive, ke
 def _drive(make_drive: MakeDrive, seed: int, scene: int, keyframes: int) -> Any:
     """Keyframes come scene by scene, so the last drive is the one that is wanted next."""
     return make_drive(seed, scene, keyframes)
+
+
+def _read_parts(parts: Path, settings: WorldSettings) -> Iterator[list[Part]]:
+    """Parts of all keyframes, scene by scene."""
+    for scene in range(settings.scenes):
+        yield [json.loads(_part_file(parts, scene, number).read_text()) for number in range(settings.keyframes)]
 
 
 def _part_file(parts: Path, scene: int, number: int) -> Path:
@@ -169,7 +165,7 @@ def _pool(workers: int) -> Iterator[Run]:
     if workers == 1:
         yield map
         return
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent) as pool:
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker) as pool:
 
         def run(function: Callable[[tuple[int, int]], None], keys: list[tuple[int, int]]) -> Iterator[None]:
             for job in as_completed([pool.submit(function, key) for key in keys]):
@@ -182,8 +178,9 @@ def _pool(workers: int) -> Iterator[Run]:
             raise
 
 
-def _end_with_parent() -> None:
-    """A worker whose parent is killed would wait for work for ever."""
+def _start_worker() -> None:
+    """Ctrl-C is the parent's to handle. A worker whose parent was killed ends: it would wait for work for ever."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
 

@@ -414,8 +414,8 @@ def _extent(town: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float
 # The data set
 
 
-def write_dataset(root: Path, settings: WorldSettings, scenes: Iterable[Sequence[Part]]) -> None:
-    """Write the maps and, last and at once, the folder of tables.
+def write_dataset(root: Path, settings: WorldSettings, scenes: Iterable[Sequence[Part]]) -> int:
+    """Write the maps and, last and at once, the folder of tables; returns the bytes of all files of the keyframes.
 
     Args:
         root: the data set.
@@ -425,11 +425,13 @@ def write_dataset(root: Path, settings: WorldSettings, scenes: Iterable[Sequence
     tables, maps = _Tables(), {location: _Map(location) for location in LOCATIONS}
     _add_fixed_rows(tables, settings)
     logs: dict[str, list[str]] = {}
+    num_bytes = 0
     for scene, parts in enumerate(scenes):
         region = REGIONS[scene]
         offset = region.offset(parts[0]["town"])
         maps[region.location].add_town(make_token(settings.seed, scene, "town"), parts[0]["town"], offset)
         logs.setdefault(region.location, []).append(_add_scene(tables, settings, scene, parts, offset))
+        num_bytes += sum(part["bytes"] for part in parts)
     for location, log_tokens in logs.items():
         token = LOCATIONS[location].token
         tables.add("map", token=token, category="semantic_prior", filename=f"maps/{token}.png", log_tokens=log_tokens)
@@ -446,6 +448,7 @@ def write_dataset(root: Path, settings: WorldSettings, scenes: Iterable[Sequence
     write_text(temporary / "splits.json", json.dumps(settings.splits(), indent=2) + "\n")
     temporary.rename(root / settings.version)
     sync_folder(root)
+    return num_bytes
 
 
 class _Tables:
