@@ -28,7 +28,7 @@ from PIL import Image, ImageDraw
 from pred.checkpoint import atomic_write, sync_folder, write_text
 from pred.data.frame import MIN_PROJECTION_DEPTH_M, Camera, invert_rigid, transform_points
 from pred.data.nuscenes import LIDAR_CHANNEL
-from pred.data.world.sensors import MOUNTS, T_EGO_FROM_LIDAR, mounted_camera
+from pred.data.world.sensors import MAX_RANGE_M, MOUNTS, T_EGO_FROM_LIDAR, mounted_camera
 
 if TYPE_CHECKING:
     from pred.data.world.drive import Actor, Drive, TownMap, View
@@ -256,14 +256,16 @@ def write_keyframe(root: Path, settings: WorldSettings, drive: Drive, scene: int
             T_world_from_lidar = drive.T_world_from_ego(camera_us) @ T_EGO_FROM_LIDAR
             T_camera_from_world = camera.T_camera_from_lidar @ invert_rigid(T_world_from_lidar)
             pictures.append(_Picture(view, camera, T_camera_from_world, camera_us))
-    num_points = _count_points(points, drive, keyframe_us)
-    shares = _visible_shares(pictures, drive.actors)
+    T_lidar_from_world = invert_rigid(drive.T_world_from_ego(keyframe_us) @ T_EGO_FROM_LIDAR)
+    actors, boxes = _actors_in_range(drive.actors, keyframe_us, T_lidar_from_world)
+    num_points = _count_points(points, boxes, [actor.size_lwh_m for actor in actors])
+    shares = _visible_shares(pictures, actors)
     part = {
         "time_us": keyframe_us,
         "data": files.data,
         "actors": [
             _actor_part(actor, keyframe_us, count, share)
-            for actor, count, share in zip(drive.actors, num_points, shares, strict=True)
+            for actor, count, share in zip(actors, num_points, shares, strict=True)
         ],
         "bytes": files.num_bytes,
     }
@@ -337,14 +339,25 @@ def _actor_part(actor: Actor, time_us: int, num_points: int, visible_share: floa
     }
 
 
-def _count_points(points: NDArray[np.float64], drive: Drive, time_us: int) -> list[int]:
-    """Points [N, 3] of a sweep inside the box of every actor, faces included: the official meaning of num_lidar_pts."""
-    T_lidar_from_world = invert_rigid(drive.T_world_from_ego(time_us) @ T_EGO_FROM_LIDAR)
+def _actors_in_range(
+    actors: Sequence[Actor], time_us: int, T_lidar_from_world: NDArray[np.float64]
+) -> tuple[list[Actor], list[NDArray[np.float64]]]:
+    """Actors of which the LiDAR can reach the centre, and T_lidar_from_box of each."""
+    boxes = [T_lidar_from_world @ actor.pose(time_us) for actor in actors]
+    near = [number for number, box in enumerate(boxes) if np.linalg.norm(box[:3, 3]) <= MAX_RANGE_M]
+    return [actors[number] for number in near], [boxes[number] for number in near]
+
+
+def _count_points(
+    points: NDArray[np.float64], boxes: Sequence[NDArray[np.float64]], sizes_m: Sequence[tuple[float, float, float]]
+) -> list[int]:
+    """Points [N, 3] of a sweep inside each box, faces included: the official meaning of num_lidar_pts."""
+    x, y = np.ascontiguousarray(points[:, 0]), np.ascontiguousarray(points[:, 1])
     counts = []
-    for actor in drive.actors:
-        T_lidar_from_box = T_lidar_from_world @ actor.pose(time_us)
-        half = np.asarray(actor.size_lwh_m) / 2
-        near = points[np.linalg.norm(points - T_lidar_from_box[:3, 3], axis=1) <= np.linalg.norm(half)]
+    for T_lidar_from_box, size_m in zip(boxes, sizes_m, strict=True):
+        half = np.asarray(size_m) / 2
+        centre_x, centre_y = T_lidar_from_box[:2, 3]
+        near = points[(x - centre_x) ** 2 + (y - centre_y) ** 2 <= half @ half]
         inside = np.abs(transform_points(invert_rigid(T_lidar_from_box), near)) <= half
         counts.append(int(inside.all(axis=1).sum()))
     return counts
@@ -585,7 +598,7 @@ def _add_annotations(
     parts: Sequence[Part],
     offset: NDArray[np.float64],
 ) -> None:
-    """Boxes of every actor from its first keyframe with a LiDAR point to its last, with those without in between."""
+    """Boxes of every actor in range from its first keyframe with a LiDAR point to its last, with and without points."""
     tracks: dict[int, list[tuple[int, Row]]] = {}
     for number, part in enumerate(parts):
         for actor in part["actors"]:
