@@ -22,6 +22,7 @@ import pytest
 from PIL import Image
 
 from pred import cli
+from pred.data.frame import Camera
 from pred.data.nuscenes import NuScenesFrames
 from pred.data.world.nuscenes_writer import (
     ATTRIBUTES,
@@ -32,6 +33,8 @@ from pred.data.world.nuscenes_writer import (
     REGION_M,
     REGIONS,
     WorldSettings,
+    _Picture,
+    _visible_shares,
     make_token,
 )
 from pred.data.world.sensors import MOUNTS, T_EGO_FROM_LIDAR, mounted_camera
@@ -44,7 +47,9 @@ from tests.data.fake_drive import (
     NUM_GROUND,
     NUM_NO_RETURN,
     POINTS_PER_ACTOR,
+    FakeActor,
     FakeDrive,
+    FakeView,
     LargeTownDrive,
     MisnamedDrive,
     SlowDrive,
@@ -280,6 +285,31 @@ def test_visibility(devkit: Any) -> None:
 
     assert level(1) == "v80-100"
     assert level(BEHIND_TRUCK) == "v0-40"
+
+
+@pytest.mark.parametrize(("depth_m", "share"), [(5.0, 0.5), (9.5, 1.0), (np.inf, 1.0)])
+def test_share_of_visible_pixels(depth_m: float, share: float) -> None:
+    """A cube of 2 m, 10 m ahead, fills 22.2 pixels each way; something covers columns up to its middle."""
+    intrinsics = np.array([[100.0, 0.0, 100.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
+    camera = Camera("CAM", intrinsics, np.eye(4), 200, 100)
+    actor = FakeActor(3, "vehicle.car", (2.0, 2.0, 2.0), (0.0, 0.0), 0.0, 0.0, "", 0)
+    T_camera_from_world = np.eye(4)
+    T_camera_from_world[2, 3] = 9.0  # the actor stands on the plane z = 0, its centre 1 m above
+    view = FakeView(
+        np.zeros((100, 200, 3), np.uint8),
+        np.zeros((100, 200), np.uint8),
+        np.zeros((100, 200), np.int32),
+        np.full((100, 200), np.inf, np.float32),
+    )
+    view.instance[39:62, 100:112] = 3
+    view.depth_m[39:62, 100:112] = 9.0
+    view.depth_m[:, :100] = depth_m
+    assert _visible_shares([_Picture(view, camera, T_camera_from_world, 0)], [actor])[0] == pytest.approx(
+        share, abs=0.03
+    )
+    T_camera_from_world[2, 3] = -0.5  # reaches behind the camera: only what shows counts
+    assert _visible_shares([picture], [actor]) == [1.0]
+    assert _visible_shares([], [actor]) == [0.0]
 
 
 def test_devkit_walks_ten_sweeps(devkit: Any) -> None:
