@@ -292,10 +292,10 @@ def test_share_of_visible_pixels(depth_m: float, share: float) -> None:
     """A cube of 2 m, 10 m ahead, fills 22.2 pixels each way; something covers columns up to its middle."""
     intrinsics = np.array([[100.0, 0.0, 100.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
     camera = Camera("CAM", intrinsics, np.eye(4), 200, 100)
-    actor = FakeActor(3, "vehicle.car", (2.0, 2.0, 2.0), (0.0, 0.0), 0.0, 0.0, "", 0)
+    actor: Any = FakeActor(3, "vehicle.car", (2.0, 2.0, 2.0), (0.0, 0.0), 0.0, 0.0, "", 0)
     T_camera_from_world = np.eye(4)
     T_camera_from_world[2, 3] = 9.0  # the actor stands on the plane z = 0, its centre 1 m above
-    view = FakeView(
+    view: Any = FakeView(
         np.zeros((100, 200, 3), np.uint8),
         np.zeros((100, 200), np.uint8),
         np.zeros((100, 200), np.int32),
@@ -304,9 +304,8 @@ def test_share_of_visible_pixels(depth_m: float, share: float) -> None:
     view.instance[39:62, 100:112] = 3
     view.depth_m[39:62, 100:112] = 9.0
     view.depth_m[:, :100] = depth_m
-    assert _visible_shares([_Picture(view, camera, T_camera_from_world, 0)], [actor])[0] == pytest.approx(
-        share, abs=0.03
-    )
+    picture = _Picture(view, camera, T_camera_from_world, 0)
+    assert _visible_shares([picture], [actor])[0] == pytest.approx(share, abs=0.03)
     T_camera_from_world[2, 3] = -0.5  # reaches behind the camera: only what shows counts
     assert _visible_shares([picture], [actor]) == [1.0]
     assert _visible_shares([], [actor]) == [0.0]

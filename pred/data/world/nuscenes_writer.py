@@ -31,7 +31,9 @@ from pred.data.nuscenes import LIDAR_CHANNEL
 from pred.data.world.sensors import MAX_RANGE_M, MOUNTS, T_EGO_FROM_LIDAR, mounted_camera
 
 if TYPE_CHECKING:
-    from pred.data.world.drive import Actor, Drive, TownMap, View
+    from pred.data.world.actors import Actor
+    from pred.data.world.drive import Drive, View
+    from pred.data.world.town import TownMap
 
 OFFICIAL_IMAGE_SIZE = (1600, 900)
 JPEG_QUALITY = 90
