@@ -666,6 +666,9 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.
     }  # fmt: skip
     assert cli.main(["world", "make", str(tmp_path), "--scenes", "0"]) == 1
     assert "scenes must be in [1, 108]" in capfd.readouterr().err
+    with pytest.raises(SystemExit):
+        cli.main(["world", "make", str(tmp_path), "--scenes", "1", "--image_scale", "1"])
+    assert "did you mean --image-scale?" in capfd.readouterr().err
 
 
 def test_summary(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
