@@ -20,7 +20,7 @@ from typing import IO, Any
 import torch
 
 _NAME = re.compile(r"step_(\d{8,})\.pt")
-_TEMPORARY_SUFFIX = ".partial"
+TEMPORARY_SUFFIX = ".partial"
 
 
 class CheckpointError(RuntimeError):
@@ -30,7 +30,7 @@ class CheckpointError(RuntimeError):
 @contextmanager
 def atomic_write(path: Path) -> Iterator[IO[bytes]]:
     """Open a binary file that replaces ``path`` when the block ends without an error, and vanishes otherwise."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}{_TEMPORARY_SUFFIX}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
     try:
         with open(temporary, "wb") as file:
             yield file
@@ -40,7 +40,7 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -119,7 +119,7 @@ def save_checkpoint(folder: Path, step: int, state: Mapping[str, Any], keep_last
     if keep_last < 1:
         raise ValueError(f"save_checkpoint: keep_last must be at least 1, got {keep_last}")
     folder.mkdir(parents=True, exist_ok=True)
-    for leftover in folder.glob(f".*{_TEMPORARY_SUFFIX}"):  # of a run that was killed while it wrote
+    for leftover in folder.glob(f".*{TEMPORARY_SUFFIX}"):  # of a run that was killed while it wrote
         leftover.unlink(missing_ok=True)
     path = checkpoint_path(folder, step)
     save_tensors(path, {**state, "step": step})
@@ -169,7 +169,7 @@ def _check_plain(value: Any, key: str) -> None:
         raise TypeError(f"save_tensors: '{key}' must be a tensor or a plain value, got {type(value).__name__}")
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Make a rename durable. Not every system can open a folder."""
     if os.name != "posix":
         return

@@ -71,6 +71,43 @@ def view(arguments: list[str]) -> None:
     )
 
 
+def world(arguments: list[str]) -> None:
+    from pred.config import ConfigParser
+    from pred.data.world.nuscenes_writer import MINI_VERSION, WORLD_VERSION, WorldSettings
+    from pred.world import make_world
+
+    parser = ConfigParser(
+        prog="pred world", description="Make a data set of procedural towns in the official nuScenes layout."
+    )
+    parser.add_argument("what", choices=["make"], help="make: write a world, or continue one that was interrupted")
+    parser.add_argument("out", metavar="OUT", help="new folder, or one in which the same command was interrupted")
+    parser.add_argument("--scenes", type=int, required=True, help="number of drives, each through a town of its own")
+    parser.add_argument("--seed", type=int, default=0, help="draws towns, drives and noise")
+    parser.add_argument("--keyframes", type=int, default=40, help="keyframes per scene, 2 a second")
+    parser.add_argument("--image-scale", type=float, default=0.25, help="size of the images against 1600 x 900")
+    parser.add_argument(
+        "--as",
+        dest="version",
+        choices=[WORLD_VERSION, MINI_VERSION],
+        default=WORLD_VERSION,
+        help=f"version; {MINI_VERSION} (10 scenes) bears the names of the official scenes and splits",
+    )
+    parser.add_argument("--sweep-images", action="store_true", help="pictures at the times between keyframes too")
+    parser.add_argument("--exact-labels", action="store_true", help="exact class maps as pseudo labels")
+    parser.add_argument("--workers", type=int | None, default=None, help="processes; one per core by default")
+    options = parser.parse_args(arguments)
+    settings = WorldSettings(
+        scenes=options.scenes,
+        seed=options.seed,
+        keyframes=options.keyframes,
+        image_scale=options.image_scale,
+        version=options.version,
+        sweep_images=options.sweep_images,
+        exact_labels=options.exact_labels,
+    )
+    make_world(Path(options.out), settings, workers=options.workers)
+
+
 def doctor(arguments: list[str]) -> None:
     from argparse import ArgumentParser
 
@@ -91,6 +128,7 @@ COMMANDS = {
     "pretrain": Command(pretrain, "pre-train a LiDAR encoder; --resume RUN continues"),
     "evaluate": Command(evaluate, "evaluate rendering RUN: errors on held-out returns"),
     "view": Command(view, "view RUN: pictures of what the run renders"),
+    "world": Command(world, "make OUT: a data set of procedural towns in the nuScenes layout"),
     "doctor": Command(doctor, "versions, backend, machine, and what is missing"),
 }
 

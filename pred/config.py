@@ -50,7 +50,8 @@ class ConfigParser(ArgumentParser):
             prefix, key = "--", found["option"].lstrip("-")
         else:
             prefix, key = "", found["key"] or f"{found['group']}.{found['member']}"
-        return did_you_mean(key, [action.dest for action in self._actions if action.option_strings], prefix)
+        known = [option.lstrip("-") for action in self._actions for option in action.option_strings]
+        return did_you_mean(key, known, prefix)
 
 
 class ConfigFile(ActionConfigFile):
