@@ -71,6 +71,23 @@ def view(arguments: list[str]) -> None:
     )
 
 
+def data(arguments: list[str]) -> None:
+    from argparse import ArgumentParser
+
+    parser = ArgumentParser("pred data", description="Go through a data set and tell what is missing or broken.")
+    parser.add_argument("what", choices=["check"], help="check: every table and file; exit status 1 if one is broken")
+    parser.add_argument("root", metavar="ROOT", type=Path, help="folder in the nuScenes layout, or of own drives")
+    parser.add_argument("--version", default=None, help="table folder (nuScenes); the only v1.0-* by default")
+    parser.add_argument("--labels", default="auto", help="folder of pseudo labels under ROOT, auto, or none")
+    parser.add_argument("--fast", action="store_true", help="read headers and sizes only")
+    options = parser.parse_args(arguments)
+    from pred.data_check import DataCheckError, check_data
+
+    report = check_data(options.root, options.version, options.labels, options.fast)
+    if report.num_problems:
+        raise DataCheckError(f"{options.root} must be intact, got {report.num_problems} problems")
+
+
 def doctor(arguments: list[str]) -> None:
     from argparse import ArgumentParser
 
@@ -91,6 +108,7 @@ COMMANDS = {
     "pretrain": Command(pretrain, "pre-train a LiDAR encoder; --resume RUN continues"),
     "evaluate": Command(evaluate, "evaluate rendering RUN: errors on held-out returns"),
     "view": Command(view, "view RUN: pictures of what the run renders"),
+    "data": Command(data, "data check ROOT: what is missing or broken in a data set"),
     "doctor": Command(doctor, "versions, backend, machine, and what is missing"),
 }
 

@@ -258,8 +258,9 @@ def read_poses(path: Path) -> tuple[NDArray[np.str_], NDArray[np.float64], NDArr
 
 
 def read_scan(path: Path, columns: list[str]) -> NDArray[np.float32]:
-    """[N, 4] float32: x, y, z, intensity (0 where the file has none). NaN in x, y or z of a .pcd file means "no return";
-    such points are left out.
+    """[N, 4] float32: x, y, z, intensity (0 where the file has none).
+
+    In .pcd files NaN in x, y or z means "no return"; such points are left out.
 
     Args:
         path: .bin, .npy or .pcd file.

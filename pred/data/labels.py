@@ -154,8 +154,8 @@ class PseudoLabel:
 
 
 def label_folder(root: Path, labels: str | None) -> Path | None:
-    """The folder that ``data.labels`` means under a root: its path there, "auto" for the only one under ``pseudo/`` (None
-    if there is none), "none".
+    """The folder that ``data.labels`` means: its path under the root; "auto", the only one under ``pseudo/`` or None if
+    there is none; or "none".
 
     Raises:
         FrameError: there is no such folder, or "auto" has several to choose from.

@@ -446,19 +446,35 @@ def read_sweep(path: Path) -> NDArray[np.float32]:
     """[N, 5] float32: x, y, z, intensity, ring."""
     try:
         content = path.read_bytes()
-    except FileNotFoundError:
-        raise FrameError(path, "sweep file must exist, got no such file (without sweeps/: data.sweeps 1)") from None
     except OSError as error:
-        raise FrameError(path, f"sweep file must be readable, got {error}") from None
-    if not content or len(content) % BYTES_PER_POINT:
-        raise FrameError(
-            path,
-            f"sweep must hold whole points of {BYTES_PER_POINT} bytes (float32 x, y, z, intensity, "
-            f"ring), got {len(content)} bytes: truncated?",
-        )
+        raise _unreadable_sweep(path, error) from None
+    _require_whole_points(path, len(content))
     points = np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(-1, 5)
     require_finite_points(path, points)
     return points
+
+
+def check_sweep_size(path: Path) -> None:
+    """Check the size of a sweep file without reading it; raises as `read_sweep`."""
+    try:
+        _require_whole_points(path, path.stat().st_size)
+    except OSError as error:
+        raise _unreadable_sweep(path, error) from None
+
+
+def _require_whole_points(path: Path, num_bytes: int) -> None:
+    if num_bytes == 0 or num_bytes % BYTES_PER_POINT:
+        raise FrameError(
+            path,
+            f"sweep must hold whole points of {BYTES_PER_POINT} bytes (float32 x, y, z, intensity, "
+            f"ring), got {num_bytes} bytes: truncated?",
+        )
+
+
+def _unreadable_sweep(path: Path, error: OSError) -> FrameError:
+    if isinstance(error, FileNotFoundError):
+        return FrameError(path, "sweep file must exist, got no such file (without sweeps/: data.sweeps 1)")
+    return FrameError(path, f"sweep file must be readable, got {error}")
 
 
 def _text(value: Any) -> str:
