@@ -1,6 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""``pred data check``: goes through all files of a data set and tells what is missing or broken, before a long run does.
+"""``pred data check``: goes through all files of a data set and tells what is missing or broken.
 
 A layout is a function that finds the files and yields one check per file, in `LAYOUTS`.
 """
@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 from rich.console import Console
@@ -70,6 +71,7 @@ class Report:
     counts: dict[str, int] = field(default_factory=dict)
     problems: dict[str, Problems] = field(default_factory=dict)
     notes: Counter[str] = field(default_factory=Counter)
+    _lock: Lock = field(default_factory=Lock, repr=False)
 
     @property
     def num_problems(self) -> int:
@@ -84,6 +86,11 @@ class Report:
         problems.count += 1
         if len(problems.examples) < MAX_EXAMPLES:
             problems.examples.append(str(problem))
+
+    def note(self, text: str) -> None:
+        """Count what may be intended; also from several threads."""
+        with self._lock:
+            self.notes[text] += 1
 
     def attempt(self, check: Check) -> None:
         """Run a check and count what it raises."""
@@ -153,7 +160,7 @@ def find_layout(root: Path, version: str | None = None) -> str:
     """
     if not root.is_dir():
         raise FrameError(root, "must be a folder, got no such folder")
-    if version is not None or any(root.glob("v1.0-*/")):
+    if version is not None or any(path.is_dir() for path in root.glob("v1.0-*")):
         return "nuscenes"
     if any(root.glob(f"*/{own.DESCRIPTION}")):
         return "folder"
@@ -171,7 +178,7 @@ def check_nuscenes(
     report.layout = f"nuScenes layout, {tables}"
     for name in DEVKIT_TABLES:
         if not (tables / f"{name}.json").is_file():
-            report.notes[f"{tables / name}.json is missing: only the official devkit needs it"] += 1
+            report.note(f"{tables / name}.json is missing: only the official devkit needs it")
     index = nuscenes.build_index(tables, report.add)
     sweeps, images = index.sweeps, index.images
     label_files = _label_folder(root, labels, report)
@@ -192,9 +199,9 @@ def check_nuscenes(
         report.add(FrameError(tables / "sample_data.json", what))
     starts = int(np.count_nonzero(sweeps.previous < 0))
     if starts > len(scenes):
-        report.notes[f"{starts:,} sweeps have none before them, but there are only {len(scenes):,} scenes"] += 1
+        report.note(f"{starts:,} sweeps have none before them, but there are only {len(scenes):,} scenes")
     if len(set(np.diff(images.offsets).tolist())) > 1:
-        report.notes["some frames have fewer camera images than others"] += 1
+        report.note("some frames have fewer camera images than others")
 
     def checks() -> Iterator[Check]:
         for path in sweeps.path:
@@ -205,9 +212,10 @@ def check_nuscenes(
             channel = str(index.calibrations.channel[images.calibration[row]])
             labels_of_camera = None if label_files is None else label_files / channel
             size = int(images.width[row]), int(images.height[row])
-            yield partial(_check_image, file, file.stem, *size, labels_of_camera, fast, report)
+            yield from _image_checks(file, file.stem, *size, labels_of_camera, fast, report)
 
-    return len(sweeps.path) + len(images.path), checks()
+    files_per_image = 1 if label_files is None else 2
+    return len(sweeps.path) + files_per_image * len(images.path), checks()
 
 
 def check_folder(
@@ -228,7 +236,7 @@ def check_folder(
         named = set(drive.stems.tolist())
         extra = [file for file in (drive.folder / own.SCANS).glob(f"*{drive.suffix}") if file.stem not in named]
         if extra:
-            report.notes[f"{len(extra):,} scans of {drive.folder} are not used: {own.POSES} has no line for them"] += 1
+            report.note(f"{len(extra):,} scans of {drive.folder} are not used: {own.POSES} has no line for them")
 
     def checks() -> Iterator[Check]:
         for drive in drives:
@@ -239,38 +247,45 @@ def check_folder(
                 for camera in drive.cameras:
                     image = own.find_image_file(drive.folder / camera.name, stem)
                     labels_of_camera = None if label_files is None else label_files / drive.folder.name / camera.name
-                    yield partial(
-                        _check_image, image, stem, camera.width, camera.height, labels_of_camera, fast, report
-                    )
+                    size = camera.width, camera.height
+                    yield from _image_checks(image, stem, *size, labels_of_camera, fast, report)
 
-    return scans + images, checks()
+    files_per_image = 1 if label_files is None else 2
+    return scans + files_per_image * images, checks()
 
 
 LAYOUTS: dict[str, Callable[[Path, str | None, str | None, bool, Report], tuple[int, Iterator[Check]]]] = {
     "nuscenes": check_nuscenes,
     "folder": check_folder,
 }
-"""By the name of `find_layout`: reports what concerns the data set as a whole, gives the number of checks and the checks
-of its files. Root, version, labels folder, whether to read headers only, and the report to fill."""
+"""By the name of `find_layout`. Each gets root, version, labels, whether to read headers only, and the report. It adds
+what concerns the data set as a whole to the report, and gives the number of files to check and a check for each."""
 
 
 def _read(read: Callable[..., object], *arguments: object) -> None:
     read(*arguments)
 
 
-def _check_image(
+def _image_checks(
     image: Path, stem: str, width: int, height: int, labels: Path | None, fast: bool, report: Report
-) -> None:
-    """Image and, with labels, the label of it."""
-    if labels is None and not image.is_file():
-        report.notes[f"images are missing, such as those in {image.parent}; training without labels does without"] += 1
+) -> Iterator[Check]:
+    """Image and, where ``labels`` is the folder of its camera, the label of it."""
+    yield partial(_check_image, image, width, height, labels is not None, fast, report)
+    if labels is not None:
+        yield partial(_check_label, labels, stem, width, height, fast)
+
+
+def _check_image(image: Path, width: int, height: int, required: bool, fast: bool, report: Report) -> None:
+    if not required and not image.is_file():
+        report.note("image is missing; training without labels does without")
         return
     check_image_header(image, width, height)
     if not fast:
         open_image(image)
-    if labels is None:
-        return
-    file = find_label_file(labels, stem)
+
+
+def _check_label(folder: Path, stem: str, width: int, height: int, fast: bool) -> None:
+    file = find_label_file(folder, stem)
     if not fast:
         PseudoLabel(file, width, height).class_map()
     elif file.stat().st_size == 0:
@@ -295,9 +310,9 @@ def _label_folder(root: Path, labels: str | None, report: Report) -> Path | None
         report.add(problem)
         return None
     if found is None:
-        report.notes["no pseudo labels: training will be LiDAR-only"] += 1
+        report.note("no pseudo labels: training will be LiDAR-only")
     else:
-        report.notes[f"pseudo labels: {found}"] += 1
+        report.note(f"pseudo labels: {found}")
     return found
 
 

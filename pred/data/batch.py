@@ -64,6 +64,8 @@ class DataConfig:
     """Table folder under `root` (nuscenes only); None: the only folder named like v1.0-*."""
     split: str | None = None
     """Name in splits.json (nuscenes: the version's) or an official nuScenes split; None: every sample."""
+    info: str | None = None
+    """Info file of OpenPCDet or mmdetection3d (nuscenes only): its samples, in its order, instead of a split."""
     sweeps: int = 10
     """LiDAR sweeps per frame, the keyframe's own included; fewer where a scene starts."""
     labels: str | None = "auto"
@@ -95,6 +97,8 @@ class DataConfig:
     def __post_init__(self) -> None:
         if self.dataset != "street" and self.root == "":
             raise ValueError("data.root must name a folder, got an empty string")
+        if self.dataset != "nuscenes" and self.info is not None:
+            raise ValueError(f"data.info must be left out for data.dataset {self.dataset}, got {self.info!r}")
         if self.dataset == "street" and self.labels not in ("auto", "none", None):
             raise ValueError(f"data.labels must be auto or none for the street, got {self.labels!r}")
         for name in ("sweeps", "batch_size", "semantic_rays_per_camera", "depth_rays"):
@@ -368,6 +372,7 @@ def build_source(config: DataConfig) -> FrameSource:
         sweeps=config.sweeps,
         labels=config.labels,
         ego_box=config.ego_box,
+        info=config.info,
     )
 
 

@@ -25,6 +25,7 @@ from pred.data.frame import (
     FrameError,
     check_image_header,
     invert_rigid,
+    transform_points,
 )
 from pred.data.index import (
     Calibrations,
@@ -38,6 +39,7 @@ from pred.data.index import (
     open_index,
     strings,
 )
+from pred.data.info_files import load_info
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
 from pred.data.sweeps import Sweep, accumulate, require_finite_points
 from pred.data.tables import Report, Row, raise_problem, read_json, read_table
@@ -52,6 +54,9 @@ TABLES = (
     "sample_annotation",
 )  # fmt: skip
 """What the index is made from."""
+
+MAX_INFO_OFFSET_M = 0.05
+"""Box centres of info files, some of them float32, differ by millimetres from those of the tables."""
 
 PROGRESS_BYTES = 50_000_000
 """Tables of at most so many bytes are read without a progress display."""
@@ -72,9 +77,10 @@ class NuScenesFrames:
             every listed image and its label must exist.
         ego_box: (x_min, y_min, x_max, y_max) in metres; returns in it are the own car and are
             removed from each sweep in the sweep's own frame.
+        info: info file of OpenPCDet or mmdetection3d; its samples, in its order, are the frames.
 
     Raises:
-        FrameError: a table is missing or damaged, or a folder cannot be found.
+        FrameError: a table is missing or damaged, a folder cannot be found, or the info file does not fit the tables.
         ValueError: the split is unknown or empty.
     """
 
@@ -86,14 +92,17 @@ class NuScenesFrames:
         sweeps: int = 10,
         labels: str | None = "auto",
         ego_box: tuple[float, float, float, float] = (-1.0, -2.0, 1.0, 3.0),
+        info: str | Path | None = None,
     ) -> None:
+        if split is not None and info is not None:
+            raise ValueError(f"data.split must not be given with data.info, which selects the frames, got {split!r}")
         self.root = Path(root)
         self.tables = self.root / version if version else only_table_folder(self.root)
         self.sweeps = sweeps
         self.ego_box = ego_box
         self.labels = label_folder(self.root, labels)
         self._index = self._open_index()
-        self._rows = self._select(split)
+        self._rows = self._select(split) if info is None else self._select_infos(Path(info))
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -144,6 +153,33 @@ class NuScenesFrames:
         if not len(rows):
             raise ValueError(f"data.split must select samples of {self.tables}, got none: {split}")
         return rows
+
+    def _select_infos(self, path: Path) -> NDArray[np.int64]:
+        """Rows of the frames that an info file lists. Its boxes must be among those of the tables."""
+        rows_by_token = {token: row for row, token in enumerate(self._index.token.to_pylist())}
+        rows = []
+        for info in load_info(path):
+            row = rows_by_token.get(info.token)
+            if row is None:
+                raise FrameError(path, f"samples must be in {self.tables}, got {info.token}, which is not")
+            if info.centres_m is not None and len(info.centres_m) and self._index.sweep[row] >= 0:
+                self._check_info_boxes(path, row, info.centres_m)
+            rows.append(row)
+        return np.array(rows, dtype=np.int64)
+
+    def _check_info_boxes(self, path: Path, row: int, centres_m: NDArray[np.float64]) -> None:
+        boxes = self._index.boxes
+        centres_world = boxes.pose[slice(*boxes.offsets[row : row + 2].tolist()), :3]
+        T_lidar_from_world = invert_rigid(self._sensor_pose(self._index.sweeps, int(self._index.sweep[row])))
+        offset_m = centres_m[:, None] - transform_points(T_lidar_from_world, centres_world)[None]
+        distance_m = np.linalg.norm(offset_m, axis=2).min(axis=1, initial=np.inf)
+        worst = int(np.argmax(distance_m))
+        if not distance_m[worst] <= MAX_INFO_OFFSET_M:
+            raise FrameError(
+                path,
+                f"boxes of sample {self._index.token[row]} must be those of {self.tables}, "
+                f"got box {worst} {distance_m[worst]:.2f} m away from the nearest",
+            )
 
     def _file(self, readings: Readings, row: int) -> Path:
         return self.root / str(readings.path[row])

@@ -1,0 +1,159 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""Info files of OpenPCDet and mmdetection3d for nuScenes: which samples, in which order, with which boxes.
+
+They are pickles, which can run any code while they are read. Here only numbers, texts, containers and NumPy arrays come
+out of them, and anything else is refused by name.
+
+Known forms: OpenPCDet's list of dictionaries (``nuscenes_infos_10sweeps_train.pkl``); mmdetection3d 1.1 and later,
+``{"metainfo", "data_list"}``; before that ``{"metadata", "infos"}``.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pred.data.frame import FrameError
+
+
+@dataclass
+class InfoFrame:
+    """One sample of an info file.
+
+    Attributes:
+        token: sample token.
+        centres_m: [M, 3] float64 centres of its boxes in the LiDAR frame; None where the file has no boxes.
+    """
+
+    token: str
+    centres_m: NDArray[np.float64] | None
+
+
+def load_info(path: str | Path) -> list[InfoFrame]:
+    """Samples of an info file, in its order.
+
+    Raises:
+        FrameError: the file is missing, damaged, of no known form, or holds anything but plain values and arrays.
+    """
+    path = Path(path)
+    content = _unpickle(path)
+    if isinstance(content, dict):
+        infos = content.get("data_list", content.get("infos"))
+    else:
+        infos = content
+    if not isinstance(infos, list) or not infos:
+        got = (
+            f"a dictionary with {', '.join(map(str, content))}" if isinstance(content, dict) else type(content).__name__
+        )
+        raise FrameError(path, f"info file must hold a list of samples, or one as data_list or infos, got {got}")
+    frames = []
+    for number, info in enumerate(infos):
+        try:
+            frames.append(_frame(info))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            what = f"no {error}" if isinstance(error, KeyError) else str(error)
+            raise FrameError(
+                path, f"sample {number} must have a nuScenes token and boxes of 7 numbers, got {what}"
+            ) from None
+    return frames
+
+
+def _frame(info: Any) -> InfoFrame:
+    token = info["token"]
+    if not isinstance(token, str):
+        raise ValueError(f"token {token!r}")
+    if "instances" in info:
+        boxes = [instance["bbox_3d"] for instance in info["instances"]]
+    elif "gt_boxes" in info:
+        boxes = info["gt_boxes"]
+    else:
+        return InfoFrame(token, None)
+    centres = np.asarray(boxes, dtype=np.float64).reshape(len(boxes), -1)
+    if len(boxes) and centres.shape[1] < 7:
+        raise ValueError(f"boxes of {centres.shape[1]} numbers")
+    return InfoFrame(token, centres[:, :3].reshape(-1, 3))
+
+
+def _unpickle(path: Path) -> Any:
+    try:
+        with open(path, "rb") as file:
+            return _PlainUnpickler(file).load()
+    except FileNotFoundError:
+        raise FrameError(path, "info file must exist, got no such file") from None
+    except _RefusedError as error:
+        raise FrameError(path, f"info file must hold plain values and NumPy arrays only, got {error}") from None
+    # Damage shows as UnpicklingError, EOFError, ValueError, IndexError, MemoryError, ...
+    except Exception as error:
+        raise FrameError(path, f"info file must be a readable pickle, got {type(error).__name__}: {error}") from None
+
+
+class _RefusedError(Exception):
+    """A pickle asks for something that is neither a plain value nor an array."""
+
+
+class _PlainUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        # NumPy 2 moved numpy.core to numpy._core.
+        found = _ALLOWED.get((module.replace("numpy._core", "numpy.core"), name))
+        if found is None:
+            raise _RefusedError(f"{module}.{name}")
+        return found
+
+    def persistent_load(self, pid: Any) -> NoReturn:
+        raise _RefusedError("a persistent id")
+
+
+class _NdarrayName:
+    """Stands for ``numpy.ndarray`` where a pickle names it, which it never needs to call."""
+
+    def __init__(self, *arguments: object) -> None:
+        raise _RefusedError("a call of numpy.ndarray")
+
+
+def _empty_array(subtype: object, shape: object, kind: object) -> NDArray[Any]:
+    """In place of ``_reconstruct``: shape, type and values come with the state that follows in the pickle."""
+    return np.empty(0, dtype=np.int8)
+
+
+def _scalar(dtype: np.dtype[Any], data: bytes = b"") -> Any:
+    if dtype.hasobject or dtype.itemsize != len(data):
+        raise ValueError(f"scalar of {dtype} from {len(data)} bytes")
+    return np.frombuffer(data, dtype=dtype)[0]
+
+
+def _array_from_buffer(
+    data: Any, dtype: np.dtype[Any], shape: tuple[int, ...], order: str, axis_order: object = None
+) -> NDArray[Any]:
+    if axis_order is not None:
+        raise ValueError(f"an array with the axes {axis_order}")
+    return np.frombuffer(data, dtype=dtype).reshape(shape, order="F" if order == "F" else "C")
+
+
+def _encode(text: str, encoding: str) -> bytes:
+    """Bytes, as pickles of protocols 0 to 2 spell them."""
+    if encoding != "latin1":
+        raise _RefusedError(f"_codecs.encode to {encoding}")
+    return text.encode("latin1")
+
+
+_ALLOWED: dict[tuple[str, str], Any] = {
+    ("numpy", "dtype"): np.dtype,
+    ("numpy", "ndarray"): _NdarrayName,
+    ("numpy.core.multiarray", "_reconstruct"): _empty_array,
+    ("numpy.core.multiarray", "scalar"): _scalar,
+    ("numpy.core.numeric", "_frombuffer"): _array_from_buffer,
+    ("_codecs", "encode"): _encode,
+    ("collections", "OrderedDict"): OrderedDict,
+    **{
+        (module, kind.__name__): kind
+        for module in ("builtins", "__builtin__")
+        for kind in (set, frozenset, bytearray, complex)
+    },
+}
