@@ -81,11 +81,11 @@ def data(arguments: list[str]) -> None:
     parser.add_argument("--labels", default="auto", help="folder of pseudo labels under ROOT, auto, or none")
     parser.add_argument("--fast", action="store_true", help="read headers and sizes only")
     options = parser.parse_args(arguments)
-    from pred.data_check import DataCheckError, check_data
+    from pred.data_check import DataCheckError, check_data, count_problems
 
     report = check_data(options.root, options.version, options.labels, options.fast)
     if report.num_problems:
-        raise DataCheckError(f"{options.root} must be intact, got {report.num_problems} problems")
+        raise DataCheckError(f"{options.root} must be intact, got {count_problems(report.num_problems)}")
 
 
 def doctor(arguments: list[str]) -> None:

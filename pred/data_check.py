@@ -147,9 +147,14 @@ def check_data(
         for line in report.lines():
             progress.message(line)
         duration = format_duration(time.monotonic() - start_time)
-        verdict = f"{report.num_problems:,} problems" if report.num_problems else "no problem"
-        progress.message(f"{verdict} in {total:,} files{' (headers and sizes only)' if fast else ''}, {duration}")
+        read = f"{total:,} files{' (headers and sizes only)' if fast else ''}"
+        progress.message(f"{count_problems(report.num_problems)} in {read}, {duration}")
     return report
+
+
+def count_problems(count: int) -> str:
+    """``no problem``, ``1 problem``, ``2 problems``."""
+    return f"{count:,} problem{'s' if count > 1 else ''}" if count else "no problem"
 
 
 def find_layout(root: Path, version: str | None = None) -> str:

@@ -211,6 +211,6 @@ def test_command(tree: Tree, capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["data", "check", str(tree.root)]) == 1
     captured = capfd.readouterr()
     assert f"{tree.sweep_files[0]}: sweep file must exist" in captured.out
-    assert f"pred data: error: {tree.root} must be intact, got 1 problems" in captured.err
+    assert f"pred data: error: {tree.root} must be intact, got 1 problem" in captured.err
     assert cli.main(["data", "check", str(tree.root / "samples")]) == 1
     assert "must hold nuScenes tables" in capfd.readouterr().err
