@@ -143,7 +143,7 @@ def check_data(
                 if problem is not None:
                     report.add(problem)
                 rate = done / max(time.monotonic() - start_time, 1e-9)
-                progress.update(done, f"{rate:.0f} files/s, {report.num_problems} problems")
+                progress.update(done, f"{rate:.0f} files/s, {count_problems(report.num_problems)}")
         for line in report.lines():
             progress.message(line)
         duration = format_duration(time.monotonic() - start_time)

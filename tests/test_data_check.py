@@ -96,7 +96,7 @@ def test_fast_reads_headers_and_sizes_only(tree: Tree) -> None:
     ("table", "change", "rule", "number"),
     [
         ("sample_data", lambda rows: rows[1].update(sample_token="other"), "known keys", 1),
-        ("sample_data", lambda rows: rows[1].update(ego_pose_token="other"), "that sample_data refers to", 1),
+        ("ego_pose", lambda rows: rows[1].update(token="other"), "that sample_data refers to", 1),
         ("sample_data", lambda rows: [row.update(timestamp=7) for row in rows], "later than the one before it", 3),
         ("sample_annotation", lambda rows: [row.update(instance_token="x") for row in rows], "known keys", 2),
         ("sample_annotation", lambda rows: rows[0].update(sample_token="x"), "known keys", 1),

@@ -75,10 +75,12 @@ def _frame(info: Any) -> InfoFrame:
         boxes = info["gt_boxes"]
     else:
         return InfoFrame(token, None)
-    centres = np.asarray(boxes, dtype=np.float64).reshape(len(boxes), -1)
-    if len(boxes) and centres.shape[1] < 7:
-        raise ValueError(f"boxes of {centres.shape[1]} numbers")
-    return InfoFrame(token, centres[:, :3].reshape(-1, 3))
+    if not len(boxes):
+        return InfoFrame(token, np.zeros((0, 3)))
+    numbers = np.asarray(boxes, dtype=np.float64).reshape(len(boxes), -1)
+    if numbers.shape[1] < 7:
+        raise ValueError(f"boxes of {numbers.shape[1]} numbers")
+    return InfoFrame(token, numbers[:, :3])
 
 
 def _unpickle(path: Path) -> Any:
@@ -154,6 +156,6 @@ _ALLOWED: dict[tuple[str, str], Any] = {
     **{
         (module, kind.__name__): kind
         for module in ("builtins", "__builtin__")
-        for kind in (set, frozenset, bytearray, complex)
+        for kind in (set, frozenset, bytes, bytearray, complex)
     },
 }

@@ -278,8 +278,8 @@ def build_index(tables: Path, report: Report = raise_problem) -> FrameIndex:
 
 
 def _build_index(read: _Reader) -> FrameIndex:
-    calibrations, calibration_rows, is_camera = _read_calibrations(read)
     frame_rows, scenes = _read_samples(read)
+    calibrations, calibration_rows, is_camera = _read_calibrations(read)
     sweeps, images, poses = _read_sample_data(
         read, frame_rows, calibrations.channel.to_pylist(), calibration_rows, is_camera
     )

@@ -132,7 +132,7 @@ def _read_ascii(path: Path, header: PcdHeader, body: bytes) -> NDArray[Any]:
         raise _damaged(path, what)
     try:
         # Integers beyond 2^53, such as times in nanoseconds, lose digits.
-        numbers = np.array(words, dtype=np.float64).reshape(header.num_points, -1)
+        numbers = np.array(words, dtype=np.float64).reshape(header.num_points, sum(shape))
     except ValueError as error:
         raise _damaged(path, f"must hold numbers, got {error}") from None
     points = np.zeros(header.num_points, dtype=header.dtype)

@@ -119,13 +119,13 @@ def _rows(path: Path, read: Callable[[int], str], advance: Callable[[int], None]
                 return ""
 
     def broken(what: str, at: int) -> FrameError:
-        return _no_json(path, f"{what} at character {dropped + at}")
+        return _no_json(path, f"{what} at character {at}")
 
     if peek() != "[":
         try:
             value, _ = decode(text + read(-1), position)
         except json.JSONDecodeError as error:
-            raise broken(error.msg, error.pos) from None
+            raise broken(error.msg, dropped + error.pos) from None
         raise FrameError(path, f"table must be a list of rows, got {type(value).__name__}")
     position += 1
     ended = peek() == "]"
@@ -136,11 +136,12 @@ def _rows(path: Path, read: Callable[[int], str], advance: Callable[[int], None]
             try:
                 row, end = decode(text, position)
             except json.JSONDecodeError as error:
+                at = dropped + error.pos
                 # Perhaps the row goes on behind the chunk.
                 if len(text) - position > CHUNK_CHARACTERS or not refill():
-                    raise broken(error.msg, error.pos) from None
+                    raise broken(error.msg, at) from None
             except RecursionError:
-                raise broken("values nested too deeply", position) from None
+                raise broken("values nested too deeply", dropped + position) from None
             else:
                 break
         if not isinstance(row, dict):
@@ -149,11 +150,11 @@ def _rows(path: Path, read: Callable[[int], str], advance: Callable[[int], None]
         yield row
         separator = peek()
         if separator not in (",", "]"):
-            raise broken("Expecting ',' or ']'" if separator else "end of file", position)
+            raise broken("Expecting ',' or ']'" if separator else "end of file", dropped + position)
         ended = separator == "]"
         position += 1
     if peek():
-        raise broken("Extra data", position)
+        raise broken("Extra data", dropped + position)
 
 
 def _unreadable(path: Path, error: OSError) -> FrameError:
