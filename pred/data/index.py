@@ -224,7 +224,7 @@ def read_index(path: Path, stamp: Stamp) -> FrameIndex | None:
     """Open an index file; None where there is none, or none of this format and of these sources."""
     try:
         source = pa.memory_map(str(path))
-        batches = {}
+        batches: dict[str, pa.RecordBatch] = {}
         for name, schema in SCHEMAS.items():
             reader = pa.ipc.open_stream(source)
             if not batches:
@@ -342,7 +342,7 @@ def _from_batches(batches: dict[str, pa.RecordBatch]) -> FrameIndex:
         ),
         poses=_matrix(batches["poses"].column("pose")),
         sweeps=Sweeps(
-            *_readings(sweeps.column),
+            **_readings(sweeps.column),
             previous=_numbers(sweeps.column("previous")),
             frame=_numbers(sweeps.column("frame")),
         ),
@@ -350,7 +350,7 @@ def _from_batches(batches: dict[str, pa.RecordBatch]) -> FrameIndex:
         recording=frames.column("recording"),
         sweep=_numbers(frames.column("sweep")),
         images=Images(
-            *_readings(images.values.field),
+            **_readings(images.values.field),
             width=_numbers(images.values.field("width")),
             height=_numbers(images.values.field("height")),
             offsets=_numbers(images.offsets),
@@ -368,8 +368,8 @@ def _reading_columns(readings: Readings) -> list[pa.Array]:
     return [readings.path, *(pa.array(column) for column in (readings.time_us, readings.calibration, readings.pose))]
 
 
-def _readings(column: Callable[[str], pa.Array]) -> tuple[Any, ...]:
-    return column("path"), *(_numbers(column(name)) for name in ("time_us", "calibration", "pose"))
+def _readings(column: Callable[[str], pa.Array]) -> dict[str, Any]:
+    return {"path": column("path"), **{name: _numbers(column(name)) for name in ("time_us", "calibration", "pose")}}
 
 
 def _lists(offsets: NDArray[np.int32], values: pa.Array) -> pa.ListArray:
