@@ -300,14 +300,12 @@ def _build_index(read: _Reader) -> FrameIndex:
 
 def _read_samples(read: _Reader) -> tuple[dict[str, int], list[str]]:
     """Row of each frame by sample token, and the scene names of the frames."""
-    scenes = dict(read("scene", lambda row: (row["token"], _text(row["name"]))))
+    scenes = dict(read("scene", lambda row: (_text(row["token"]), _text(row["name"]))))
     rows: dict[str, int] = {}
 
     def read_row(row: Row) -> str:
         token, scene = _text(row["token"]), scenes[row["scene_token"]]
-        if token in rows:
-            raise ValueError(f"token {token}, which another row has")
-        rows[token] = len(rows)
+        _add_row(rows, token)
         return scene
 
     return rows, read("sample", read_row)
@@ -315,7 +313,9 @@ def _read_samples(read: _Reader) -> tuple[dict[str, int], list[str]]:
 
 def _read_calibrations(read: _Reader) -> tuple[Calibrations, dict[str, int], list[bool]]:
     """The sensors, their row by token, and which of them are cameras."""
-    sensors = dict(read("sensor", lambda row: (row["token"], (_text(row["channel"]), row["modality"] == "camera"))))
+    sensors = dict(
+        read("sensor", lambda row: (_text(row["token"]), (_text(row["channel"]), row["modality"] == "camera")))
+    )
     rows: dict[str, int] = {}
 
     def read_row(row: Row) -> tuple[str, bool, list[float], list[float]]:
@@ -324,7 +324,7 @@ def _read_calibrations(read: _Reader) -> tuple[Calibrations, dict[str, int], lis
         if is_camera and not (np.shape(intrinsics) == (3, 3) and np.isfinite(intrinsics).all()):
             raise ValueError(f"camera_intrinsic must be 3 x 3 numbers, got {intrinsics}")
         pose = _pose(row)
-        rows[row["token"]] = len(rows)
+        _add_row(rows, row["token"])
         return channel, is_camera, pose, np.ravel(intrinsics).tolist() if is_camera else [0.0] * 9
 
     read_rows = read("calibrated_sensor", read_row)
@@ -441,8 +441,8 @@ def _read_ego_poses(read: _Reader, needed: set[str]) -> tuple[dict[str, int], ND
 
 
 def _read_boxes(read: _Reader, frame_rows: dict[str, int]) -> IndexedBoxes:
-    categories = dict(read("category", lambda row: (row["token"], _text(row["name"]))))
-    category_of = dict(read("instance", lambda row: (row["token"], categories[row["category_token"]])))
+    categories = dict(read("category", lambda row: (_text(row["token"]), _text(row["name"]))))
+    category_of = dict(read("instance", lambda row: (_text(row["token"]), categories[row["category_token"]])))
     names: list[str] = []
     frames = array("q")
     numbers = array("d")  # ten for each box: pose, length, width, height
@@ -511,6 +511,13 @@ def _unreadable_sweep(path: Path, error: OSError) -> FrameError:
     if isinstance(error, FileNotFoundError):
         return FrameError(path, "sweep file must exist, got no such file (without sweeps/: data.sweeps 1)")
     return FrameError(path, f"sweep file must be readable, got {error}")
+
+
+def _add_row(rows: dict[str, int], token: Any) -> None:
+    """Number a kept row by its token."""
+    if _text(token) in rows:
+        raise ValueError(f"token {token}, which another row has")
+    rows[token] = len(rows)
 
 
 def _text(value: Any) -> str:
