@@ -24,6 +24,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from benchmarks.measure import machine_record
 from benchmarks.memory import status_bytes
 from pred.data import nuscenes
 from pred.data.index import (
@@ -77,6 +78,7 @@ def main() -> None:
     if options.measure:
         print(json.dumps(MEASUREMENTS[options.measure](options)))
         return
+    started = time.strftime("%Y-%m-%dT%H:%M:%S%z")
     tables = options.folder / VERSION
     if not (tables / f"{options.samples}.complete").is_file():
         start_time = time.monotonic()
@@ -90,8 +92,15 @@ def main() -> None:
         figures[name] = in_own_process(name, sys.argv[1:])
         print(f"{name:<16}" + "  ".join(f"{key} {value}" for key, value in figures[name].items()), flush=True)
     if options.json is not None:
-        record = {"samples": options.samples, "once_frames": options.once_frames, "cores": multiprocessing.cpu_count()}
-        options.json.write_text(json.dumps({**record, "command": sys.argv[1:], "figures": figures}, indent=2) + "\n")
+        record = {
+            "command": "python -m benchmarks.index_scale FOLDER",
+            "samples": options.samples,
+            "once_frames": options.once_frames,
+            "started": started,
+            **machine_record(),
+            "figures": figures,
+        }
+        options.json.write_text(json.dumps(record, indent=2) + "\n")
 
 
 def in_own_process(name: str, arguments: list[str]) -> dict[str, Any]:
