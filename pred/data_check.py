@@ -136,13 +136,13 @@ def check_data(
     total, checks = LAYOUTS[name](root, version, labels, fast, report)
     workers = os.cpu_count() or 1
     with Progress("checking files", total, console=console) as progress, ThreadPoolExecutor(workers) as pool:
-        done = 0
+        done, checks_start_time = 0, time.monotonic()
         while batch := list(islice(checks, CHECKS_AT_ONCE)):
             for problem in pool.map(_problem, batch):
                 done += 1
                 if problem is not None:
                     report.add(problem)
-                rate = done / max(time.monotonic() - start_time, 1e-9)
+                rate = done / max(time.monotonic() - checks_start_time, 1e-9)
                 progress.update(done, f"{rate:.0f} files/s, {count_problems(report.num_problems)}")
         for line in report.lines():
             progress.message(line)

@@ -29,7 +29,7 @@ import pyarrow.compute as pc
 import pyarrow.ipc
 from numpy.typing import NDArray
 
-from pred.checkpoint import atomic_write
+from pred.checkpoint import atomic_write, remove_leftovers
 from pred.data.frame import FrameError
 
 FILE_NAME = "pred_index.arrow"
@@ -266,6 +266,7 @@ def _write_and_open(places: Sequence[Path], built: FrameIndex, stamp: Stamp) -> 
         try:
             if place is not places[0]:
                 place.parent.mkdir(parents=True, exist_ok=True)
+            remove_leftovers(place)
             write_index(place, built, stamp)
         except OSError as error:
             errors.append(str(error))

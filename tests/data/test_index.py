@@ -9,6 +9,7 @@ import json
 import multiprocessing
 import os
 import pickle
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -212,6 +213,23 @@ def test_a_failed_build_leaves_nothing(tree: Tree, monkeypatch: pytest.MonkeyPat
     with pytest.raises(RuntimeError, match="killed"):
         NuScenesFrames(tree.root)
     assert sorted(tree.tables.iterdir()) == before
+
+
+def _die_while_writing(root: Path) -> None:
+    os.fsync = lambda descriptor: os.kill(os.getpid(), signal.SIGKILL)  # type: ignore[assignment]
+    NuScenesFrames(root)
+
+
+def test_a_killed_build_is_done_again(tree: Tree) -> None:
+    before = sorted(tree.tables.iterdir())
+    process = multiprocessing.get_context("fork").Process(target=_die_while_writing, args=(tree.root,))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    left = sorted(set(tree.tables.iterdir()) - set(before))
+    assert [path.suffix for path in left] == [".partial"]
+    NuScenesFrames(tree.root)
+    assert sorted(tree.tables.iterdir()) == sorted([*before, tree.tables / FILE_NAME])
 
 
 def test_another_process_opens_the_file_itself(tree: Tree, builds: list[Path]) -> None:
