@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Info files of OpenPCDet and mmdetection3d for nuScenes: which samples, in which order, with which boxes.
 
-They are pickles, which can run any code while they are read. Here only numbers, texts, containers and NumPy arrays come
-out of them, and anything else is refused by name.
+They are pickles, which can run any code while they are read. Here only numbers, texts, containers and stand-ins for NumPy
+arrays come out of them; anything else is refused by name. NumPy's own unpickling is left out too, since a damaged file
+can crash the process in it.
 
 Known forms: OpenPCDet's list of dictionaries (``nuscenes_infos_10sweeps_train.pkl``); mmdetection3d 1.1 and later,
 ``{"metainfo", "data_list"}``; before that ``{"metadata", "infos"}``.
@@ -12,6 +13,7 @@ Known forms: OpenPCDet's list of dictionaries (``nuscenes_infos_10sweeps_train.p
 from __future__ import annotations
 
 import pickle
+import re
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,6 +75,7 @@ def _frame(info: Any) -> InfoFrame:
         boxes = [instance["bbox_3d"] for instance in info["instances"]]
     elif "gt_boxes" in info:
         boxes = info["gt_boxes"]
+        boxes = boxes.to_numpy() if isinstance(boxes, _Array) else boxes
     else:
         return InfoFrame(token, None)
     if not len(boxes):
@@ -112,30 +115,59 @@ class _PlainUnpickler(pickle.Unpickler):
         raise _RefusedError("a persistent id")
 
 
-class _NdarrayName:
-    """Stands for ``numpy.ndarray`` where a pickle names it, which it never needs to call."""
+class _Dtype:
+    """Stands for ``numpy.dtype``, whose own way to take its state from a damaged pickle crashes."""
+
+    def __init__(self, text: str, *rest: object) -> None:
+        if not re.fullmatch(r"[a-zA-Z?]\d*", text):
+            raise ValueError(f"array of type {text}")
+        self._text = text
+        self._order = "="
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self._order = str(state[1])
+
+    def to_numpy(self) -> np.dtype[Any]:
+        dtype = np.dtype(self._text)
+        if dtype.kind not in "biuf":
+            raise ValueError(f"array of type {self._text}")
+        return dtype.newbyteorder({"<": "<", ">": ">"}.get(self._order, "="))  # type: ignore[arg-type]
+
+
+class _Array:
+    """Stands for ``numpy.ndarray``: shape, type and bytes, of which `to_numpy` makes the array if it is numeric."""
 
     def __init__(self, *arguments: object) -> None:
-        raise _RefusedError("a call of numpy.ndarray")
+        """Of an array without its state nothing is known: ``_reconstruct`` makes one, and the state follows."""
+        self._state: tuple[Any, ...] = (1, (0,), None, False, b"")
 
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self._state = state
 
-def _empty_array(subtype: object, shape: object, kind: object) -> NDArray[Any]:
-    """In place of ``_reconstruct``: shape, type and values come with the state that follows in the pickle."""
-    return np.empty(0, dtype=np.int8)
-
-
-def _scalar(dtype: np.dtype[Any], data: bytes = b"") -> Any:
-    if dtype.hasobject or dtype.itemsize != len(data):
-        raise ValueError(f"scalar of {dtype} from {len(data)} bytes")
-    return np.frombuffer(data, dtype=dtype)[0]
+    def to_numpy(self) -> NDArray[Any]:
+        _, shape, dtype, is_fortran, data = self._state
+        if not (isinstance(dtype, _Dtype) and isinstance(data, bytes | bytearray)):
+            raise ValueError("an array of objects")
+        return np.frombuffer(bytes(data), dtype.to_numpy()).reshape(shape, order="F" if is_fortran else "C")
 
 
 def _array_from_buffer(
-    data: Any, dtype: np.dtype[Any], shape: tuple[int, ...], order: str, axis_order: object = None
-) -> NDArray[Any]:
+    data: object, dtype: object, shape: object, order: object, axis_order: object = None
+) -> _Array | None:
     if axis_order is not None:
-        raise ValueError(f"an array with the axes {axis_order}")
-    return np.frombuffer(data, dtype=dtype).reshape(shape, order="F" if order == "F" else "C")
+        return None
+    array = _Array()
+    array.__setstate__((1, shape, dtype, order == "F", data))
+    return array
+
+
+def _scalar(dtype: _Dtype, data: object = b"") -> Any:
+    """A number; None for scalars of other types, which are not looked at."""
+    try:
+        (number,) = np.frombuffer(data, dtype.to_numpy())  # type: ignore[call-overload]
+    except ValueError:
+        return None
+    return number
 
 
 def _encode(text: str, encoding: str) -> bytes:
@@ -146,9 +178,9 @@ def _encode(text: str, encoding: str) -> bytes:
 
 
 _ALLOWED: dict[tuple[str, str], Any] = {
-    ("numpy", "dtype"): np.dtype,
-    ("numpy", "ndarray"): _NdarrayName,
-    ("numpy.core.multiarray", "_reconstruct"): _empty_array,
+    ("numpy", "dtype"): _Dtype,
+    ("numpy", "ndarray"): _Array,
+    ("numpy.core.multiarray", "_reconstruct"): _Array,
     ("numpy.core.multiarray", "scalar"): _scalar,
     ("numpy.core.numeric", "_frombuffer"): _array_from_buffer,
     ("_codecs", "encode"): _encode,
