@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Info files of OpenPCDet and mmdetection3d for nuScenes: which samples, in which order, with which boxes.
 
-They are pickles, which can run any code while they are read. Here only numbers, texts, containers and stand-ins for NumPy
-arrays come out of them; anything else is refused by name. NumPy's own unpickling is left out too, since a damaged file
-can crash the process in it.
+They are pickles, which can run any code while they are read. Here only numbers, texts, containers and stand-ins for
+NumPy arrays come out of them; anything else is refused by name. NumPy's own unpickling is left out too, since a damaged
+file can crash the process in it.
 
 Known forms: OpenPCDet's list of dictionaries (``nuscenes_infos_10sweeps_train.pkl``); mmdetection3d 1.1 and later,
 ``{"metainfo", "data_list"}``; before that ``{"metadata", "infos"}``.
@@ -71,6 +71,7 @@ def _frame(info: Any) -> InfoFrame:
     token = info["token"]
     if not isinstance(token, str):
         raise ValueError(f"token {token!r}")
+    boxes: Any
     if "instances" in info:
         boxes = [instance["bbox_3d"] for instance in info["instances"]]
     elif "gt_boxes" in info:
