@@ -234,7 +234,7 @@ def read_index(path: Path, stamp: Stamp) -> FrameIndex | None:
             if not reader.schema.equals(schema):
                 return None
             (batches[name],) = reader
-            batches[name].validate()
+            _require_sound(batches[name])
     except (OSError, ValueError, pa.ArrowException):  # missing, cut short, or something else under this name
         return None
     return _from_batches(batches)
@@ -329,6 +329,25 @@ def _columns(index: FrameIndex) -> dict[str, list[pa.Array]]:
             _lists(boxes.offsets, pa.StructArray.from_arrays(box_fields, fields=list(_BOX))),
         ],
     }
+
+
+def _require_sound(batch: pa.RecordBatch) -> None:
+    """
+    Raises:
+        ValueError: a text or a list of the batch reaches outside of the file.
+    """
+    batch.validate()  # of offsets, it looks at the first and the last only
+    columns = list(batch.columns)
+    while columns:
+        column = columns.pop()
+        if pa.types.is_struct(column.type):
+            columns += [column.field(number) for number in range(column.type.num_fields)]
+        elif pa.types.is_list(column.type):
+            columns.append(column.values)
+        if pa.types.is_list(column.type) or pa.types.is_string(column.type):
+            offsets = np.frombuffer(column.buffers()[1] or b"", dtype=np.int32)[: len(column) + 1]
+            if not (offsets[1:] >= offsets[:-1]).all():
+                raise ValueError("offsets must not descend")
 
 
 def _from_batches(batches: dict[str, pa.RecordBatch]) -> FrameIndex:

@@ -173,6 +173,23 @@ def test_damaged_and_other_files_are_made_anew(tree: Tree, builds: list[Path], d
     assert len(builds) == 2
 
 
+@pytest.mark.parametrize("column", ["token", "path"])
+def test_texts_that_reach_outside_of_the_file(tree: Tree, tmp_path: Path, column: str) -> None:
+    """Reading one would end the process."""
+    built = build_index(tree.tables)
+    owner: Any = built if column == "token" else built.images
+    texts = getattr(owner, column)
+    offsets = np.arange(len(texts) + 1, dtype=np.int32)
+    write_index(tmp_path / "good.arrow", built, {})
+    assert read_index(tmp_path / "good.arrow", {}) is not None
+    for wrong in (1 << 30, -5):
+        offsets[1] = wrong
+        buffers = pa.py_buffer(offsets.copy()), pa.py_buffer(b"x" * len(texts))
+        setattr(owner, column, pa.StringArray.from_buffers(len(texts), *buffers))
+        write_index(tmp_path / "bad.arrow", built, {})
+        assert read_index(tmp_path / "bad.arrow", {}) is None
+
+
 @contextmanager
 def _refuse(path: Path, folder: Path) -> Iterator[IO[bytes]]:
     if path.parent == folder:
