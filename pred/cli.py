@@ -108,6 +108,23 @@ def world(arguments: list[str]) -> None:
     make_world(Path(options.out), settings, workers=options.workers)
 
 
+def data(arguments: list[str]) -> None:
+    from argparse import ArgumentParser
+
+    parser = ArgumentParser("pred data", description="Go through a data set and tell what is missing or broken.")
+    parser.add_argument("what", choices=["check"], help="check: every table and file; exit status 1 if one is broken")
+    parser.add_argument("root", metavar="ROOT", type=Path, help="folder in the nuScenes layout, or of own drives")
+    parser.add_argument("--version", default=None, help="table folder (nuScenes); the only v1.0-* by default")
+    parser.add_argument("--labels", default="auto", help="folder of pseudo labels under ROOT, auto, or none")
+    parser.add_argument("--fast", action="store_true", help="read headers and sizes only")
+    options = parser.parse_args(arguments)
+    from pred.data_check import DataCheckError, check_data, count_problems
+
+    report = check_data(options.root, options.version, options.labels, options.fast)
+    if report.num_problems:
+        raise DataCheckError(f"{options.root} must be intact, got {count_problems(report.num_problems)}")
+
+
 def doctor(arguments: list[str]) -> None:
     from argparse import ArgumentParser
 
@@ -129,6 +146,7 @@ COMMANDS = {
     "evaluate": Command(evaluate, "evaluate rendering RUN: errors on held-out returns"),
     "view": Command(view, "view RUN: pictures of what the run renders"),
     "world": Command(world, "make OUT: a data set of procedural towns in the nuScenes layout"),
+    "data": Command(data, "data check ROOT: what is missing or broken in a data set"),
     "doctor": Command(doctor, "versions, backend, machine, and what is missing"),
 }
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -72,12 +73,14 @@ def require_native() -> None:
 
 
 @pytest.fixture(scope="session")
-def nuscenes_tiny() -> Path:
-    """Root of the real keyframe."""
+def nuscenes_tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Root of the real keyframe, in a copy of its folders with links to its files: the reader adds its index."""
     folder = os.environ.get("PRED_TEST_DATA")
     if not folder:
         pytest.skip("PRED_TEST_DATA is not set: no real data")
     root = Path(folder) / "nuscenes_tiny"
     if not root.is_dir():
         pytest.fail(f"PRED_TEST_DATA is set, but {root} is not a folder")
-    return root
+    linked = tmp_path_factory.mktemp("data") / root.name
+    shutil.copytree(root.resolve(), linked, copy_function=os.symlink)
+    return linked

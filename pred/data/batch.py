@@ -20,7 +20,6 @@ from torch.utils.data import DataLoader, Dataset
 
 from pred.data.frame import NUM_CLASSES, Frame, FrameError, FrameSource
 from pred.data.masking import visible_points
-from pred.data.nuscenes import NuScenesFrames
 from pred.data.rays import (
     NEAR_M,
     DepthCandidates,
@@ -57,14 +56,16 @@ TensorHolder = TypeVar("TensorHolder", bound="Rays | Batch")
 class DataConfig:
     """What is read, what is hidden from the encoder, and how many rays are drawn."""
 
-    dataset: Literal["street", "nuscenes"] = "nuscenes"
-    """Procedural street, or the official nuScenes layout under `root`."""
+    dataset: Literal["street", "nuscenes", "folder"] = "nuscenes"
+    """Procedural street, the official nuScenes layout under `root`, or a folder of own drives under `root`."""
     root: str | None = None
-    """Folder of the data set (nuscenes only)."""
+    """Folder of the data set (not for the street)."""
     version: str | None = None
-    """Table folder under `root`; None: the only folder named like v1.0-*."""
+    """Table folder under `root` (nuscenes only); None: the only folder named like v1.0-*."""
     split: str | None = None
-    """Name in the version's splits.json or an official split name; None: every sample."""
+    """Name in splits.json (nuscenes: the version's) or an official nuScenes split; None: every sample."""
+    info: str | None = None
+    """Info file of OpenPCDet or mmdetection3d (nuscenes only): its samples, in its order, instead of a split."""
     sweeps: int = 10
     """LiDAR sweeps per frame, the keyframe's own included; fewer where a scene starts."""
     labels: str | None = "auto"
@@ -94,8 +95,10 @@ class DataConfig:
     """The procedural street (street only)."""
 
     def __post_init__(self) -> None:
-        if self.dataset == "nuscenes" and self.root == "":
+        if self.dataset != "street" and self.root == "":
             raise ValueError("data.root must name a folder, got an empty string")
+        if self.dataset != "nuscenes" and self.info is not None:
+            raise ValueError(f"data.info must be left out for data.dataset {self.dataset}, got {self.info!r}")
         if self.dataset == "street" and self.labels not in ("auto", "none", None):
             raise ValueError(f"data.labels must be auto or none for the street, got {self.labels!r}")
         for name in ("sweeps", "batch_size", "semantic_rays_per_camera", "depth_rays"):
@@ -348,12 +351,20 @@ def build_source(config: DataConfig) -> FrameSource:
         FrameError, ValueError: they cannot be found.
     """
     if config.dataset == "street":
-        # Simulation needs a ray caster that readers of real data do not.
+        # Each import brings what the others do not need: a ray caster, Arrow.
         from pred.data.world import StreetFrames
 
         return StreetFrames(config.street, labels=config.labels not in ("none", None))
     if config.root is None:
         raise ValueError("data.root must name the folder of the data set, got None")
+    if config.dataset == "folder":
+        from pred.data.folder import FolderFrames
+
+        return FolderFrames(
+            config.root, split=config.split, sweeps=config.sweeps, labels=config.labels, ego_box=config.ego_box
+        )
+    from pred.data.nuscenes import NuScenesFrames
+
     return NuScenesFrames(
         config.root,
         version=config.version,
@@ -361,6 +372,7 @@ def build_source(config: DataConfig) -> FrameSource:
         sweeps=config.sweeps,
         labels=config.labels,
         ego_box=config.ego_box,
+        info=config.info,
     )
 
 

@@ -153,6 +153,26 @@ class PseudoLabel:
         return LabelLookup(target, confidence, class_id)
 
 
+def label_folder(root: Path, labels: str | None) -> Path | None:
+    """The folder that ``data.labels`` means: its path under the root; "auto", the only one under ``pseudo/`` or None if
+    there is none; or "none".
+
+    Raises:
+        FrameError: there is no such folder, or "auto" has several to choose from.
+    """
+    if labels is None or labels == "none":
+        return None
+    if labels == "auto":
+        folders = sorted(path for path in (root / "pseudo").glob("*") if path.is_dir())
+        if len(folders) > 1:
+            names = ", ".join(path.name for path in folders)
+            raise FrameError(root / "pseudo", f"must hold one label folder, or data.labels name it, got {names}")
+        return folders[0] if folders else None
+    if not (root / labels).is_dir():
+        raise FrameError(root / labels, "data.labels must be a folder, got no such folder")
+    return root / labels
+
+
 def find_label_file(folder: Path, stem: str) -> Path:
     """The label file ``<folder>/<stem>`` with one of the known suffixes.
 

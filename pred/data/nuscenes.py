@@ -2,19 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reader for drive logs in the official nuScenes layout (JSON tables, samples/, sweeps/).
 
-The tables of the full data set hold millions of rows. They are parsed once, rows that are not
-needed are dropped while parsing, and the rest is kept in arrays, which forked loader workers share.
+The tables of the full data set hold millions of rows. `build_index` reads them once, into the file of
+`pred.data.index`; `NuScenesFrames` reads that file, and loader processes share its pages.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from array import array
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,47 +25,41 @@ from pred.data.frame import (
     FrameError,
     check_image_header,
     invert_rigid,
+    transform_points,
 )
-from pred.data.labels import PseudoLabel, find_label_file
-from pred.data.sweeps import place_sweep
+from pred.data.index import (
+    Calibrations,
+    FrameIndex,
+    Images,
+    IndexedBoxes,
+    Readings,
+    Sweeps,
+    number_lists,
+    offsets_of,
+    open_index,
+    strings,
+)
+from pred.data.info_files import load_info
+from pred.data.labels import PseudoLabel, find_label_file, label_folder
+from pred.data.sweeps import Sweep, accumulate, require_finite_points
+from pred.data.tables import Report, Row, raise_problem, read_json, read_table
+from pred.progress import Progress
 
 LIDAR_CHANNEL = "LIDAR_TOP"
 BYTES_PER_POINT = 20  # float32 x, y, z, intensity, ring
 MICROSECONDS = 1e-6
 
-Row = dict[str, Any]
-T = TypeVar("T")
+TABLES = (
+    "sensor", "calibrated_sensor", "scene", "sample", "sample_data", "ego_pose", "category", "instance",
+    "sample_annotation",
+)  # fmt: skip
+"""What the index is made from."""
 
+MAX_INFO_OFFSET_M = 0.05
+"""Box centres of info files, some of them float32, differ by millimetres from those of the tables."""
 
-class _Calibration(NamedTuple):
-    channel: str
-    modality: str
-    T_ego_from_sensor: NDArray[np.float64]
-    intrinsics: list[list[float]]
-
-
-@dataclass
-class _SensorData:
-    """The used rows of sample_data as columns: LiDAR sweeps and keyframe images, n in all."""
-
-    filename: list[str]
-    time_us: NDArray[np.int64]  # [n]
-    calibration: NDArray[np.int64]  # [n]
-    previous: NDArray[np.int64]  # [n] row of the sweep before, -1 at the start of a scene
-    size: NDArray[np.int64]  # [n, 2] image width and height
-    keyframe_of: NDArray[np.int64]  # [n] sample whose keyframe the row is, -1 for sweeps in between
-    ego_pose: NDArray[np.float64]  # [n, 7] translation, quaternion w x y z, ego to world
-
-
-@dataclass
-class _Annotations:
-    """Boxes of all samples in world coordinates; sample i owns rows offsets[i]:offsets[i + 1]."""
-
-    offsets: NDArray[np.int64]
-    pose: NDArray[np.float64]  # [m, 7] translation, quaternion
-    size_wlh: NDArray[np.float64]  # [m, 3]
-    name_id: NDArray[np.int64]  # [m]
-    names: list[str]
+PROGRESS_BYTES = 50_000_000
+"""Tables of at most so many bytes are read without a progress display."""
 
 
 class NuScenesFrames:
@@ -84,9 +77,10 @@ class NuScenesFrames:
             every listed image and its label must exist.
         ego_box: (x_min, y_min, x_max, y_max) in metres; returns in it are the own car and are
             removed from each sweep in the sweep's own frame.
+        info: info file of OpenPCDet or mmdetection3d; its samples, in its order, are the frames.
 
     Raises:
-        FrameError: a table is missing or damaged, or a folder cannot be found.
+        FrameError: a table is missing or damaged, a folder cannot be found, or the info file does not fit the tables.
         ValueError: the split is unknown or empty.
     """
 
@@ -98,24 +92,24 @@ class NuScenesFrames:
         sweeps: int = 10,
         labels: str | None = "auto",
         ego_box: tuple[float, float, float, float] = (-1.0, -2.0, 1.0, 3.0),
+        info: str | Path | None = None,
     ) -> None:
+        if split is not None and info is not None:
+            raise ValueError(f"data.split must not be given with data.info, which selects the frames, got {split!r}")
         self.root = Path(root)
-        self.tables = self.root / version if version else _only_table_folder(self.root)
+        self.tables = self.root / version if version else only_table_folder(self.root)
         self.sweeps = sweeps
         self.ego_box = ego_box
-        self.labels = _label_folder(self.root, labels)
-        self._tokens = self._read_samples(split)
-        sample_rows = {token: row for row, token in enumerate(self._tokens)}
-        self._calibrations, calibration_rows = self._read_calibrations()
-        self._read_sample_data(sample_rows, calibration_rows)
-        self._annotations = self._read_annotations(sample_rows)
+        self.labels = label_folder(self.root, labels)
+        self._index = self._open_index()
+        self._rows = self._select(split) if info is None else self._select_infos(Path(info))
 
     def __len__(self) -> int:
-        return len(self._tokens)
+        return len(self._rows)
 
     def token(self, index: int) -> str:
         """Sample token of frame ``index``."""
-        return self._tokens[index]
+        return str(self._index.token[self._rows[index]])
 
     def load(self, index: int) -> Frame:
         """Read the sweeps of keyframe ``index``. With labels, images are checked by their headers
@@ -124,301 +118,412 @@ class NuScenesFrames:
         Raises:
             FrameError: a file is missing, truncated, of the wrong type or size, or holds NaN or Inf.
         """
-        token = self._tokens[index]
-        keyframe = int(self._lidar_rows[index])
+        row = int(self._rows[index])
+        token = self.token(index)
+        keyframe = int(self._index.sweep[row])
         if keyframe < 0:
-            raise FrameError(
-                self.tables / "sample_data.json",
-                f"sample {token} must have a {LIDAR_CHANNEL} keyframe, got none",
-            )
-        T_world_from_lidar = self._sensor_pose(keyframe)
-        points, point_index, is_keyframe, earlier_keyframes = self._accumulate_sweeps(keyframe, T_world_from_lidar)
-        camera_rows = [int(row) for row in self._camera_rows[index] if row >= 0]
+            raise no_keyframe(self.tables, token)
+        T_world_from_lidar = self._sensor_pose(self._index.sweeps, keyframe)
+        sweeps = accumulate(self._sweeps(keyframe, T_world_from_lidar), self.ego_box)
+        images = range(*self._index.images.offsets[row : row + 2])
         return Frame(
             token=token,
-            points=points,
-            point_index=point_index,
-            is_keyframe=is_keyframe,
-            cameras=[self._camera(row, T_world_from_lidar) for row in camera_rows],
+            **sweeps._asdict(),
+            cameras=[self._camera(image, T_world_from_lidar) for image in images],
             T_world_from_lidar=T_world_from_lidar,
-            source=str(self.root / self._data.filename[keyframe]),
-            boxes=self._boxes(index, T_world_from_lidar),
-            earlier_keyframes=earlier_keyframes,
+            source=str(self._file(self._index.sweeps, keyframe)),
+            boxes=self._boxes(row, T_world_from_lidar),
         )
 
-    # Frames
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_index"}
 
-    def _sensor_pose(self, row: int) -> NDArray[np.float64]:
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """In another process the file is opened again, instead of sending its content there."""
+        vars(self).update(state)
+        self._index = self._open_index()
+
+    def _open_index(self) -> FrameIndex:
+        sources = [self.tables / f"{name}.json" for name in TABLES]
+        return open_index(self.tables, sources, partial(build_index, self.tables))
+
+    def _select(self, split: str | None) -> NDArray[np.int64]:
+        """Rows of the split's frames in the index, in table order."""
+        rows = np.arange(len(self._index)) if split is None else self._index.frames_of(_scene_names(self.tables, split))
+        if not len(rows):
+            raise ValueError(f"data.split must select samples of {self.tables}, got none: {split}")
+        return rows
+
+    def _select_infos(self, path: Path) -> NDArray[np.int64]:
+        """Rows of the frames that an info file lists. Its boxes must be among those of the tables."""
+        rows_by_token = {token: row for row, token in enumerate(self._index.token.to_pylist())}
+        rows = []
+        for info in load_info(path):
+            row = rows_by_token.get(info.token)
+            if row is None:
+                raise FrameError(path, f"samples must be in {self.tables}, got {info.token}, which is not")
+            if info.centres_m is not None and len(info.centres_m) and self._index.sweep[row] >= 0:
+                self._check_info_boxes(path, row, info.centres_m)
+            rows.append(row)
+        return np.array(rows, dtype=np.int64)
+
+    def _check_info_boxes(self, path: Path, row: int, centres_m: NDArray[np.float64]) -> None:
+        boxes = self._index.boxes
+        centres_world = boxes.pose[slice(*boxes.offsets[row : row + 2].tolist()), :3]
+        T_lidar_from_world = invert_rigid(self._sensor_pose(self._index.sweeps, int(self._index.sweep[row])))
+        offset_m = centres_m[:, None] - transform_points(T_lidar_from_world, centres_world)[None]
+        distance_m = np.linalg.norm(offset_m, axis=2).min(axis=1, initial=np.inf)
+        worst = int(np.argmax(distance_m))
+        if not distance_m[worst] <= MAX_INFO_OFFSET_M:
+            raise FrameError(
+                path,
+                f"boxes of sample {self._index.token[row]} must be those of {self.tables}, "
+                f"got box {worst} {distance_m[worst]:.2f} m away from the nearest",
+            )
+
+    def _file(self, readings: Readings, row: int) -> Path:
+        return self.root / str(readings.path[row])
+
+    def _sensor_pose(self, readings: Readings, row: int) -> NDArray[np.float64]:
         """T_world_from_sensor at the time of the measurement."""
-        T_world_from_ego = _rigid(self._data.ego_pose[row])
-        return T_world_from_ego @ self._calibrations[self._data.calibration[row]].T_ego_from_sensor
+        T_world_from_ego = rigid(self._index.poses[readings.pose[row]])
+        return T_world_from_ego @ rigid(self._index.calibrations.pose[readings.calibration[row]])
 
-    def _accumulate_sweeps(
-        self, keyframe: int, T_world_from_lidar: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.bool_], dict[str, slice]]:
-        """`Frame.points`, `Frame.point_index`, `Frame.is_keyframe` and `Frame.earlier_keyframes`."""
-        points, point_index, is_keyframe = [], [], []
-        earlier_keyframes: dict[str, slice] = {}
-        num_points = 0
+    def _sweeps(self, keyframe: int, T_world_from_lidar: NDArray[np.float64]) -> Iterator[Sweep]:
+        """The keyframe's own sweep and those before it."""
+        sweeps = self._index.sweeps
         row = keyframe
         for _ in range(self.sweeps):
-            sweep = _read_sweep(self.root / self._data.filename[row])
-            # A keyframe's points stay as measured, to the bit.
-            T = np.eye(4) if row == keyframe else invert_rigid(T_world_from_lidar) @ self._sensor_pose(row)
-            lag_s = float(self._data.time_us[keyframe] - self._data.time_us[row]) * MICROSECONDS
-            sweep, kept = place_sweep(sweep, T, self.ego_box, lag_s)
-            points.append(sweep)
-            point_index.append(kept)
-            is_keyframe.append(np.full(len(kept), row == keyframe))
-            sample = int(self._data.keyframe_of[row])
-            if sample >= 0 and row != keyframe:
-                earlier_keyframes[self._tokens[sample]] = slice(num_points, num_points + len(kept))
-            num_points += len(kept)
-            row = int(self._data.previous[row])
+            frame = int(sweeps.frame[row])
+            yield Sweep(
+                points=read_sweep(self._file(sweeps, row)),
+                # A keyframe's points stay as measured, to the bit.
+                T_keyframe_from_sweep=np.eye(4)
+                if row == keyframe
+                else invert_rigid(T_world_from_lidar) @ self._sensor_pose(sweeps, row),
+                lag_s=float(sweeps.time_us[keyframe] - sweeps.time_us[row]) * MICROSECONDS,
+                frame=str(self._index.token[frame]) if frame >= 0 else None,
+            )
+            row = int(sweeps.previous[row])
             if row < 0:
-                break
-        return np.concatenate(points), np.concatenate(point_index), np.concatenate(is_keyframe), earlier_keyframes
+                return
 
     def _camera(self, row: int, T_world_from_lidar: NDArray[np.float64]) -> Camera:
-        calibration = self._calibrations[self._data.calibration[row]]
-        width, height = (int(pixels) for pixels in self._data.size[row])
-        image = self.root / self._data.filename[row]
+        images = self._index.images
+        calibration = int(images.calibration[row])
+        channel = str(self._index.calibrations.channel[calibration])
+        width, height = int(images.width[row]), int(images.height[row])
+        image = self._file(images, row)
         labels = None
         if self.labels is not None:
             check_image_header(image, width, height)
-            label_file = find_label_file(self.labels / calibration.channel, image.stem)
-            labels = PseudoLabel(label_file, width, height)
+            labels = PseudoLabel(find_label_file(self.labels / channel, image.stem), width, height)
         return Camera(
-            name=calibration.channel,
-            intrinsics=np.asarray(calibration.intrinsics),
+            name=channel,
+            intrinsics=self._index.calibrations.intrinsics[calibration],
             # Through the world: the ego car moves between the LiDAR's and the camera's time.
-            T_camera_from_lidar=invert_rigid(self._sensor_pose(row)) @ T_world_from_lidar,
+            T_camera_from_lidar=invert_rigid(self._sensor_pose(images, row)) @ T_world_from_lidar,
             width=width,
             height=height,
             image=image if labels is not None or image.is_file() else None,
             labels=labels,
         )
 
-    def _boxes(self, index: int, T_world_from_lidar: NDArray[np.float64]) -> Boxes:
-        all_boxes = self._annotations
-        rows = slice(int(all_boxes.offsets[index]), int(all_boxes.offsets[index + 1]))
+    def _boxes(self, row: int, T_world_from_lidar: NDArray[np.float64]) -> Boxes:
+        boxes = self._index.boxes
+        rows = slice(*boxes.offsets[row : row + 2].tolist())
         T_lidar_from_world = invert_rigid(T_world_from_lidar)
-        poses = [T_lidar_from_world @ _rigid(pose) for pose in all_boxes.pose[rows]]
+        poses = [T_lidar_from_world @ rigid(pose) for pose in boxes.pose[rows]]
         T_lidar_from_box = np.stack(poses) if poses else np.zeros((0, 4, 4))
         return Boxes(
             centre_m=T_lidar_from_box[:, :3, 3],
-            size_m=all_boxes.size_wlh[rows][:, [1, 0, 2]],
+            size_m=boxes.size_lwh[rows],
             yaw_rad=np.arctan2(T_lidar_from_box[:, 1, 0], T_lidar_from_box[:, 0, 0]),
-            names=[all_boxes.names[name_id] for name_id in all_boxes.name_id[rows]],
+            names=boxes.name[rows].to_pylist(),
         )
 
-    # Tables
 
-    def _table(self, name: str, read_row: Callable[[Row], T | None]) -> list[T]:
-        return _read_table(self.tables / f"{name}.json", read_row)
+# The index
 
-    def _read_samples(self, split: str | None) -> list[str]:
-        """Tokens of the split's samples, in table order."""
-        wanted = None if split is None else _scene_names(self.tables, split)
-        scene_names = dict(self._table("scene", lambda row: (row["token"], row["name"])))
 
-        def read_row(row: Row) -> str | None:
-            name = scene_names[row["scene_token"]]
-            token: str = row["token"]
-            return token if wanted is None or name in wanted else None
+class _Reader(NamedTuple):
+    """Reads the tables of one folder."""
 
-        tokens = self._table("sample", read_row)
-        if not tokens:
-            raise ValueError(f"data.split must select samples of {self.tables}, got none: {split}")
-        return tokens
+    folder: Path
+    report: Report
+    advance: Callable[[int], None]
 
-    def _read_calibrations(self) -> tuple[list[_Calibration], dict[str, int]]:
-        sensors = {
-            token: (channel, modality)
-            for token, channel, modality in self._table(
-                "sensor", lambda row: (row["token"], row["channel"], row["modality"])
-            )
-        }
-        rows: dict[str, int] = {}
+    def __call__(self, name: str, read_row: Callable[[Row], Any]) -> list[Any]:
+        return read_table(self.folder / f"{name}.json", read_row, self.report, self.advance)
 
-        def read_row(row: Row) -> _Calibration:
-            rows[row["token"]] = len(rows)
-            channel, modality = sensors[row["sensor_token"]]
-            intrinsics = row["camera_intrinsic"]
-            if modality == "camera" and not _is_finite_3x3(intrinsics):
-                raise ValueError(f"camera_intrinsic must be 3 x 3 numbers, got {intrinsics}")
-            return _Calibration(channel, modality, _rigid(np.array(_pose(row))), intrinsics)
 
-        return self._table("calibrated_sensor", read_row), rows
+def build_index(tables: Path, report: Report = raise_problem) -> FrameIndex:
+    """Read the tables of a version folder. Of sample_data, LIDAR_TOP and the cameras' keyframes are kept.
 
-    def _read_sample_data(self, sample_rows: dict[str, int], calibration_rows: dict[str, int]) -> None:
-        data_rows: dict[str, int] = {}
-        previous_tokens: list[str] = []
-        pose_tokens: list[str] = []
-        filenames: list[str] = []
-        numbers = array("q")  # time, calibration, width, height, keyframe_of
-        keyframes: list[tuple[int, str, int]] = []  # sample row, channel, data row
+    Args:
+        tables: folder with the JSON tables.
+        report: gets each problem as a `FrameError`; if it returns, the rows concerned are left out.
+    """
+    num_bytes = sum(path.stat().st_size for name in TABLES if (path := tables / f"{name}.json").is_file())
+    large = num_bytes > PROGRESS_BYTES
+    with Progress(f"indexing {tables.name}, MB", max(1, num_bytes // 1_000_000), enabled=large) as progress:
+        done = 0
 
-        def read_row(row: Row) -> None:
-            sample = sample_rows.get(row["sample_token"])
-            calibration = calibration_rows[row["calibrated_sensor_token"]]
-            channel, modality = self._calibrations[calibration][:2]
-            is_keyframe = row["is_key_frame"]
-            is_image = modality == "camera" and is_keyframe
-            if sample is None or not (channel == LIDAR_CHANNEL or is_image):
-                return
-            if is_keyframe:
-                keyframes.append((sample, channel, len(filenames)))
-            data_rows[row["token"]] = len(filenames)
-            previous_tokens.append(row["prev"])
-            pose_tokens.append(row["ego_pose_token"])
-            filenames.append(row["filename"])
-            width, height = (row["width"], row["height"]) if is_image else (0, 0)
-            if is_image and not (width > 0 and height > 0):
+        def advance(characters: int) -> None:
+            nonlocal done
+            done += characters
+            progress.update(min(done, num_bytes) // 1_000_000)
+
+        return _build_index(_Reader(tables, report, advance))
+
+
+def _build_index(read: _Reader) -> FrameIndex:
+    frame_rows, scenes = _read_samples(read)
+    calibrations, calibration_rows, is_camera = _read_calibrations(read)
+    sweeps, images, poses = _read_sample_data(
+        read, frame_rows, calibrations.channel.to_pylist(), calibration_rows, is_camera
+    )
+    own_sweep = np.full(len(frame_rows), -1, dtype=np.int32)
+    keyframes = np.flatnonzero(sweeps.frame >= 0)
+    own_sweep[sweeps.frame[keyframes]] = keyframes
+    return FrameIndex(
+        calibrations=calibrations,
+        poses=poses,
+        sweeps=sweeps,
+        token=strings(list(frame_rows)),
+        recording=strings(scenes),
+        sweep=own_sweep,
+        images=images,
+        boxes=_read_boxes(read, frame_rows),
+    )
+
+
+def _read_samples(read: _Reader) -> tuple[dict[str, int], list[str]]:
+    """Row of each frame by sample token, and the scene names of the frames."""
+    scenes = dict(read("scene", lambda row: (_text(row["token"]), _text(row["name"]))))
+    rows: dict[str, int] = {}
+
+    def read_row(row: Row) -> str:
+        token, scene = _text(row["token"]), scenes[row["scene_token"]]
+        _add_row(rows, token)
+        return scene
+
+    return rows, read("sample", read_row)
+
+
+def _read_calibrations(read: _Reader) -> tuple[Calibrations, dict[str, int], list[bool]]:
+    """The sensors, their row by token, and which of them are cameras."""
+    sensors = dict(
+        read("sensor", lambda row: (_text(row["token"]), (_text(row["channel"]), row["modality"] == "camera")))
+    )
+    rows: dict[str, int] = {}
+
+    def read_row(row: Row) -> tuple[str, bool, list[float], list[float]]:
+        channel, is_camera = sensors[row["sensor_token"]]
+        intrinsics = row["camera_intrinsic"]
+        if is_camera and not (np.shape(intrinsics) == (3, 3) and np.isfinite(intrinsics).all()):
+            raise ValueError(f"camera_intrinsic must be 3 x 3 numbers, got {intrinsics}")
+        pose = _pose(row)
+        _add_row(rows, row["token"])
+        return channel, is_camera, pose, np.ravel(intrinsics).tolist() if is_camera else [0.0] * 9
+
+    read_rows = read("calibrated_sensor", read_row)
+    calibrations = Calibrations(
+        channel=strings([channel for channel, _, _, _ in read_rows]),
+        pose=np.array([pose for _, _, pose, _ in read_rows], dtype=np.float64).reshape(-1, 7),
+        intrinsics=np.array([intrinsics for _, _, _, intrinsics in read_rows], dtype=np.float64).reshape(-1, 3, 3),
+        distortion=number_lists([[]] * len(read_rows)),
+    )
+    return calibrations, rows, [is_camera for _, is_camera, _, _ in read_rows]
+
+
+class _Rows:
+    """Rows of sample_data of one kind, as columns that grow."""
+
+    def __init__(self) -> None:
+        self.paths: list[str] = []
+        self.pose_tokens: list[str] = []
+        self.numbers = array("q")  # five for each row
+
+    def add(self, row: Row, calibration: int, frame: int, width: int = 0, height: int = 0) -> None:
+        numbers = array("q", (row["timestamp"], calibration, frame, width, height))
+        path, pose_token = _text(row["filename"]), _text(row["ego_pose_token"])
+        # Nothing is kept of a row with a wrong value.
+        self.paths.append(path)
+        self.pose_tokens.append(pose_token)
+        self.numbers.extend(numbers)
+
+    def columns(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Times, and [4, n] calibration, frame, width, height."""
+        numbers = np.frombuffer(self.numbers, dtype=np.int64).reshape(-1, 5).T
+        return numbers[0].copy(), numbers[1:].astype(np.int32)
+
+
+def _read_sample_data(
+    read: _Reader,
+    frame_rows: dict[str, int],
+    channels: list[str],
+    calibration_rows: dict[str, int],
+    is_camera: list[bool],
+) -> tuple[Sweeps, Images, NDArray[np.float64]]:
+    """LiDAR sweeps, keyframe images, and the poses that both refer to."""
+    sweep_rows, image_rows = _Rows(), _Rows()
+    row_of_sweep: dict[str, int] = {}
+    previous_tokens: list[str] = []
+
+    def read_row(row: Row) -> None:
+        calibration = calibration_rows[row["calibrated_sensor_token"]]
+        is_keyframe = row["is_key_frame"]
+        if is_camera[calibration] and is_keyframe:
+            width, height = row["width"], row["height"]
+            if not (width > 0 and height > 0):
                 raise ValueError(f"width and height must be positive, got {width} x {height}")
-            numbers.extend((row["timestamp"], calibration, width, height, sample if is_keyframe else -1))
+            image_rows.add(row, calibration, frame_rows[row["sample_token"]], width, height)
+        elif channels[calibration] == LIDAR_CHANNEL:
+            frame = frame_rows[row["sample_token"]]
+            token, previous = row["token"], row["prev"]
+            sweep_rows.add(row, calibration, frame if is_keyframe else -1)
+            row_of_sweep[token] = len(previous_tokens)
+            previous_tokens.append(previous)
 
-        self._table("sample_data", read_row)
-        columns = np.frombuffer(numbers, dtype=np.int64).reshape(-1, 5)
-        self._data = _SensorData(
-            filename=filenames,
-            time_us=columns[:, 0],
-            calibration=columns[:, 1],
-            # A sweep that is not in the table (a subset of a scene) ends the walk like a start.
-            previous=np.array([data_rows.get(token, -1) for token in previous_tokens], np.int64),
-            size=columns[:, 2:4],
-            keyframe_of=columns[:, 4],
-            ego_pose=self._read_ego_poses(pose_tokens),
-        )
-        is_camera = [c.modality == "camera" for c in self._calibrations]
-        channels = sorted({channel for _, channel, row in keyframes if is_camera[columns[row, 1]]})
-        column_of = {channel: column for column, channel in enumerate(channels)}
-        self._lidar_rows = np.full(len(sample_rows), -1, dtype=np.int64)
-        self._camera_rows = np.full((len(sample_rows), len(channels)), -1, dtype=np.int64)
-        for sample, channel, row in keyframes:
-            if channel == LIDAR_CHANNEL:
-                self._lidar_rows[sample] = row
-            else:
-                self._camera_rows[sample, column_of[channel]] = row
+    read("sample_data", read_row)
+    pose_rows, poses = _read_ego_poses(read, {*sweep_rows.pose_tokens, *image_rows.pose_tokens})
 
-    def _read_ego_poses(self, tokens: list[str]) -> NDArray[np.float64]:
-        needed = set(tokens)
-        rows: dict[str, int] = {}
-        numbers = array("d")
+    def rows_of_poses(rows: _Rows) -> NDArray[np.int32]:
+        return np.array([pose_rows.get(token, -1) for token in rows.pose_tokens], dtype=np.int32)
 
-        def read_row(row: Row) -> None:
-            token = row["token"]
-            if token in needed and token not in rows:
-                rows[token] = len(rows)
-                numbers.extend(_pose(row))
-
-        self._table("ego_pose", read_row)
-        for token in tokens:
-            if token not in rows:
-                raise FrameError(
-                    self.tables / "ego_pose.json",
-                    f"table must have the row {token} that sample_data refers to, got no such row",
-                )
-        poses = np.frombuffer(numbers, dtype=np.float64).reshape(-1, 7)
-        return poses[[rows[token] for token in tokens]]
-
-    def _read_annotations(self, sample_rows: dict[str, int]) -> _Annotations:
-        categories = dict(self._table("category", lambda row: (row["token"], row["name"])))
-        name_ids = {token: name_id for name_id, token in enumerate(categories)}
-        instances = dict(self._table("instance", lambda row: (row["token"], name_ids[row["category_token"]])))
-        owners, box_names = array("q"), array("q")
-        poses, sizes = array("d"), array("d")
-
-        def read_row(row: Row) -> None:
-            sample = sample_rows.get(row["sample_token"])
-            if sample is None:
-                return
-            size_wlh = row["size"]
-            if len(size_wlh) != 3:
-                raise ValueError(f"size must have 3 numbers, got {size_wlh}")
-            owners.append(sample)
-            box_names.append(instances[row["instance_token"]])
-            poses.extend(_pose(row))
-            sizes.extend(size_wlh)
-
-        self._table("sample_annotation", read_row)
-        owner = np.frombuffer(owners, dtype=np.int64)
-        order = np.argsort(owner, kind="stable")
-        counts = np.bincount(owner, minlength=len(sample_rows))
-        return _Annotations(
-            offsets=np.concatenate([[0], np.cumsum(counts)]),
-            pose=np.frombuffer(poses, dtype=np.float64).reshape(-1, 7)[order],
-            size_wlh=np.frombuffer(sizes, dtype=np.float64).reshape(-1, 3)[order],
-            name_id=np.frombuffer(box_names, dtype=np.int64)[order],
-            names=list(categories.values()),
-        )
+    time_us, (calibration, frame, _, _) = sweep_rows.columns()
+    sweeps = Sweeps(
+        path=strings(sweep_rows.paths),
+        time_us=time_us,
+        calibration=calibration,
+        pose=rows_of_poses(sweep_rows),
+        # A sweep that is not in the table (a subset of a scene) ends the walk like a start.
+        previous=np.array([row_of_sweep.get(token, -1) for token in previous_tokens], dtype=np.int32),
+        frame=frame,
+    )
+    time_us, (calibration, frame, width, height) = image_rows.columns()
+    order = _image_order(frame, [channels[row] for row in calibration])
+    images = Images(
+        path=strings(image_rows.paths).take(order),
+        time_us=time_us[order],
+        calibration=calibration[order],
+        pose=rows_of_poses(image_rows)[order],
+        width=width[order],
+        height=height[order],
+        offsets=offsets_of(frame[order], len(frame_rows)),
+    )
+    return sweeps, images, poses
 
 
-def _read_sweep(path: Path) -> NDArray[np.float32]:
+def _image_order(frame: NDArray[np.int32], channel: list[str]) -> NDArray[np.int64]:
+    """Rows of images by frame and then channel; of several images of one camera the last."""
+    rows = {(owner, name): row for row, (owner, name) in enumerate(zip(frame.tolist(), channel, strict=True))}
+    return np.array([rows[key] for key in sorted(rows)], dtype=np.int64)
+
+
+def _read_ego_poses(read: _Reader, needed: set[str]) -> tuple[dict[str, int], NDArray[np.float64]]:
+    """The poses with the needed tokens, and their row by token."""
+    rows: dict[str, int] = {}
+    numbers = array("d")
+
+    def read_row(row: Row) -> None:
+        token = row["token"]
+        if token in needed and token not in rows:
+            numbers.extend(_pose(row))
+            rows[token] = len(rows)
+
+    read("ego_pose", read_row)
+    for token in sorted(needed - rows.keys()):
+        what = f"table must have the row {token} that sample_data refers to, got no such row"
+        read.report(FrameError(read.folder / "ego_pose.json", what))
+    return rows, np.frombuffer(numbers, dtype=np.float64).reshape(-1, 7)
+
+
+def _read_boxes(read: _Reader, frame_rows: dict[str, int]) -> IndexedBoxes:
+    categories = dict(read("category", lambda row: (_text(row["token"]), _text(row["name"]))))
+    category_of = dict(read("instance", lambda row: (_text(row["token"]), categories[row["category_token"]])))
+    names: list[str] = []
+    frames = array("q")
+    numbers = array("d")  # ten for each box: pose, length, width, height
+
+    def read_row(row: Row) -> None:
+        if len(row["size"]) != 3:
+            raise ValueError(f"size must have 3 numbers, got {row['size']}")
+        width, length, height = (float(number) for number in row["size"])
+        if not (width >= 0 and length >= 0 and height >= 0 and math.isfinite(width + length + height)):
+            raise ValueError(f"size must be finite and not negative, got {row['size']}")
+        name, frame, pose = category_of[row["instance_token"]], frame_rows[row["sample_token"]], _pose(row)
+        names.append(name)
+        frames.append(frame)
+        numbers.extend((*pose, length, width, height))
+
+    read("sample_annotation", read_row)
+    frame = np.frombuffer(frames, dtype=np.int64)
+    order = np.argsort(frame, kind="stable")
+    columns = np.frombuffer(numbers, dtype=np.float64).reshape(-1, 10)[order]
+    return IndexedBoxes(
+        name=strings(names).take(order),
+        pose=columns[:, :7],
+        size_lwh=columns[:, 7:],
+        offsets=offsets_of(frame, len(frame_rows)),
+    )
+
+
+def no_keyframe(tables: Path, token: str) -> FrameError:
+    """The error of a sample without a LiDAR sweep."""
+    return FrameError(tables / "sample_data.json", f"sample {token} must have a {LIDAR_CHANNEL} keyframe, got none")
+
+
+# Files
+
+
+def read_sweep(path: Path) -> NDArray[np.float32]:
     """[N, 5] float32: x, y, z, intensity, ring."""
     try:
         content = path.read_bytes()
-    except FileNotFoundError:
-        raise FrameError(path, "sweep file must exist, got no such file (without sweeps/: data.sweeps 1)") from None
     except OSError as error:
-        raise FrameError(path, f"sweep file must be readable, got {error}") from None
-    if not content or len(content) % BYTES_PER_POINT:
-        raise FrameError(
-            path,
-            f"sweep must hold whole points of {BYTES_PER_POINT} bytes (float32 x, y, z, intensity, "
-            f"ring), got {len(content)} bytes: truncated?",
-        )
+        raise _unreadable_sweep(path, error) from None
+    _require_whole_points(path, len(content))
     points = np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(-1, 5)
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
-        raise FrameError(
-            path,
-            f"points must be finite, got NaN or Inf in {np.count_nonzero(~finite)} of "
-            f"{len(points)} points, first in point {np.argmin(finite)}",
-        )
+    require_finite_points(path, points)
     return points
 
 
-def _read_json(path: Path) -> Any:
-    return _parse_json(path, None)
-
-
-def _read_table(path: Path, read_row: Callable[[Row], T | None]) -> list[T]:
-    """Rows of a JSON table, each turned by ``read_row`` while parsing; None drops a row."""
-    num_rows = 0
-
-    def checked(row: Row) -> T | None:
-        nonlocal num_rows
-        num_rows += 1
-        try:
-            return read_row(row)
-        except KeyError as error:
-            what = f"row {num_rows} must have, and refer to, known keys, got no {error}"
-        except (TypeError, ValueError, OverflowError) as error:
-            what = f"row {num_rows} must be well-formed, got {error}"
-        raise FrameError(path, what)
-
-    rows = _parse_json(path, checked)
-    if not isinstance(rows, list):
-        raise FrameError(path, f"table must be a list of rows, got {type(rows).__name__}")
-    return [row for row in rows if row is not None]
-
-
-def _parse_json(path: Path, read_object: Callable[[Row], Any] | None) -> Any:
+def check_sweep_size(path: Path) -> None:
+    """Check the size of a sweep file without reading it; raises as `read_sweep`."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"), object_hook=read_object)
-    except FileNotFoundError:
-        raise FrameError(path, "table must exist, got no such file") from None
+        _require_whole_points(path, path.stat().st_size)
     except OSError as error:
-        raise FrameError(path, f"table must be readable, got {error}") from None
-    except FrameError:
-        raise
-    except ValueError as error:
-        raise FrameError(path, f"table must be valid JSON, got {error}") from None
+        raise _unreadable_sweep(path, error) from None
 
 
-def _is_finite_3x3(matrix: Any) -> bool:
-    return np.shape(matrix) == (3, 3) and bool(np.isfinite(matrix).all())
+def _require_whole_points(path: Path, num_bytes: int) -> None:
+    if num_bytes == 0 or num_bytes % BYTES_PER_POINT:
+        raise FrameError(
+            path,
+            f"sweep must hold whole points of {BYTES_PER_POINT} bytes (float32 x, y, z, intensity, "
+            f"ring), got {num_bytes} bytes: truncated?",
+        )
+
+
+def _unreadable_sweep(path: Path, error: OSError) -> FrameError:
+    if isinstance(error, FileNotFoundError):
+        return FrameError(path, "sweep file must exist, got no such file (without sweeps/: data.sweeps 1)")
+    return FrameError(path, f"sweep file must be readable, got {error}")
+
+
+def _add_row(rows: dict[str, int], token: Any) -> None:
+    """Number a kept row by its token."""
+    if _text(token) in rows:
+        raise ValueError(f"token {token}, which another row has")
+    rows[token] = len(rows)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"{value!r}, which is not text")
+    return value
 
 
 def _pose(row: Row) -> list[float]:
@@ -432,7 +537,7 @@ def _pose(row: Row) -> list[float]:
     return pose
 
 
-def _rigid(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def rigid(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """[4, 4] matrix of a translation and a quaternion (w, x, y, z)."""
     w, x, y, z = pose[3:] / np.linalg.norm(pose[3:])
     matrix = np.eye(4)
@@ -445,7 +550,7 @@ def _rigid(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrix
 
 
-def _only_table_folder(root: Path) -> Path:
+def only_table_folder(root: Path) -> Path:
     if not root.is_dir():
         raise FrameError(root, "data.root must be a folder, got no such folder")
     folders = sorted(path for path in root.glob("v1.0-*") if path.is_dir())
@@ -458,23 +563,9 @@ def _only_table_folder(root: Path) -> Path:
     return folders[0]
 
 
-def _label_folder(root: Path, labels: str | None) -> Path | None:
-    if labels is None or labels == "none":
-        return None
-    if labels == "auto":
-        folders = sorted(path for path in (root / "pseudo").glob("*") if path.is_dir())
-        if len(folders) > 1:
-            names = ", ".join(path.name for path in folders)
-            raise FrameError(root / "pseudo", f"must hold one label folder, or data.labels name it, got {names}")
-        return folders[0] if folders else None
-    if not (root / labels).is_dir():
-        raise FrameError(root / labels, "data.labels must be a folder, got no such folder")
-    return root / labels
-
-
 def _scene_names(tables: Path, split: str) -> set[str]:
     path = tables / "splits.json"
-    own = _read_json(path) if path.is_file() else {}
+    own = read_json(path) if path.is_file() else {}
     if not isinstance(own, dict):
         raise FrameError(path, f"must map split names to scene names, got {type(own).__name__}")
     if split in own:

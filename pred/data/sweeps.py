@@ -1,13 +1,17 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""Placing one LiDAR sweep in the keyframe's frame: the inner loop of loader workers."""
+"""Placing LiDAR sweeps in the keyframe's frame: the inner loop of loader workers."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pred.data.frame import outside_ego_box, transform_points
+from pred.data.frame import FrameError, outside_ego_box, transform_points
 
 try:
     from pred import _host
@@ -55,3 +59,60 @@ def place_sweep_reference(
     placed[:, 3] = points[kept, 3]
     placed[:, 4] = lag_s
     return placed, kept
+
+
+def require_finite_points(path: Path, points: NDArray[np.float32]) -> None:
+    """
+    Raises:
+        FrameError: a value of ``points`` [N, C] is NaN or infinite; names the file and the first such point.
+    """
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        raise FrameError(
+            path,
+            f"points must be finite, got NaN or Inf in {np.count_nonzero(~finite)} of "
+            f"{len(points)} points, first in point {np.argmin(finite)}",
+        )
+
+
+class Sweep(NamedTuple):
+    """One sweep to be placed in a keyframe.
+
+    Attributes:
+        points: [N, >= 4] float32 x, y, z, intensity in the sweep's own LiDAR frame, metres.
+        T_keyframe_from_sweep: [4, 4] rigid transform.
+        lag_s: age of the sweep, seconds behind the keyframe.
+        frame: token of the frame whose own sweep it is; None for sweeps in between.
+    """
+
+    points: NDArray[np.float32]
+    T_keyframe_from_sweep: NDArray[np.float64]
+    lag_s: float
+    frame: str | None
+
+
+class Accumulated(NamedTuple):
+    """Fields of `pred.data.frame.Frame` that its sweeps make."""
+
+    points: NDArray[np.float32]
+    point_index: NDArray[np.int64]
+    is_keyframe: NDArray[np.bool_]
+    earlier_keyframes: dict[str, slice]
+
+
+def accumulate(sweeps: Iterable[Sweep], ego_box: tuple[float, float, float, float]) -> Accumulated:
+    """Joins the sweeps of one frame, of which the first is its own, each placed by `place_sweep`."""
+    points, point_index, is_keyframe = [], [], []
+    earlier_keyframes: dict[str, slice] = {}
+    num_points = 0
+    for number, sweep in enumerate(sweeps):
+        placed, kept = place_sweep(sweep.points, sweep.T_keyframe_from_sweep, ego_box, sweep.lag_s)
+        points.append(placed)
+        point_index.append(kept)
+        is_keyframe.append(np.full(len(kept), number == 0))
+        if number > 0 and sweep.frame is not None:
+            earlier_keyframes[sweep.frame] = slice(num_points, num_points + len(kept))
+        num_points += len(kept)
+    return Accumulated(
+        np.concatenate(points), np.concatenate(point_index), np.concatenate(is_keyframe), earlier_keyframes
+    )

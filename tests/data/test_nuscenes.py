@@ -273,6 +273,13 @@ def test_missing_table_keys(tree: Tree, table: str, row: int, key: str) -> None:
         ("sample_data", "calibrated_sensor_token", "other", "got no 'other'"),
         ("sample_data", "timestamp", "noon", "row 2 must be well-formed"),
         ("sample_annotation", "size", [1.0, 2.0], "size must have 3 numbers"),
+        ("sample_annotation", "size", [1.0, 2.0, -1.0], "size must be finite and not negative"),
+        ("sample_annotation", "sample_token", "other", "got no 'other'"),
+        ("sample_data", "sample_token", "other", "got no 'other'"),
+        ("sample_data", "filename", None, "row 2 must be well-formed, got None, which is not text"),
+        ("sample", "token", "scene-a-sample-0", "token scene-a-sample-0, which another row has"),
+        ("calibrated_sensor", "token", "calibrated-LIDAR_TOP", "token calibrated-LIDAR_TOP, which another row has"),
+        ("category", "token", [], r"got \[\], which is not text"),
     ],
 )
 def test_wrong_table_values(tree: Tree, table: str, key: str, value: Any, text: str) -> None:

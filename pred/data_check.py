@@ -1,0 +1,331 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""``pred data check``: goes through all files of a data set and tells what is missing or broken.
+
+A layout is a function that finds the files and yields one check per file, in `LAYOUTS`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+from rich.console import Console
+
+from pred.data import folder as own
+from pred.data import nuscenes
+from pred.data.frame import FrameError, check_image_header, open_image
+from pred.data.labels import PseudoLabel, find_label_file, label_folder
+from pred.data.tables import read_json
+from pred.progress import Progress, format_duration
+
+MAX_EXAMPLES = 3
+CHECKS_AT_ONCE = 1024
+
+DEVKIT_TABLES = ("attribute", "visibility", "log", "map")
+"""Tables that the official devkit demands and this package does not read."""
+
+Check = Callable[[], None]
+"""Raises `FrameError`, or OSError, if a file is missing or broken."""
+
+
+class DataCheckError(ValueError):
+    """The data set has problems, which were reported."""
+
+
+@dataclass
+class Problems:
+    """Problems with the same rule.
+
+    Attributes:
+        count: how many.
+        examples: texts of the first ones, each naming its file.
+    """
+
+    count: int = 0
+    examples: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Report:
+    """What a check found.
+
+    Attributes:
+        layout: name of the layout.
+        counts: what the data set holds: scenes, frames, ...
+        problems: by rule.
+        notes: what may be intended.
+    """
+
+    layout: str = ""
+    counts: dict[str, int] = field(default_factory=dict)
+    problems: dict[str, Problems] = field(default_factory=dict)
+    notes: Counter[str] = field(default_factory=Counter)
+    _lock: Lock = field(default_factory=Lock, repr=False)
+
+    @property
+    def num_problems(self) -> int:
+        """All problems."""
+        return sum(problems.count for problems in self.problems.values())
+
+    def add(self, problem: FrameError) -> None:
+        """Count a problem."""
+        # One rule, whatever the row, token or size it speaks of.
+        rule = re.sub(r"\S*\d\S*", "…", problem.what.split(", got")[0])
+        problems = self.problems.setdefault(rule, Problems())
+        problems.count += 1
+        if len(problems.examples) < MAX_EXAMPLES:
+            problems.examples.append(str(problem))
+
+    def note(self, text: str) -> None:
+        """Count what may be intended; also from several threads."""
+        with self._lock:
+            self.notes[text] += 1
+
+    def attempt(self, check: Check) -> None:
+        """Run a check and count what it raises."""
+        problem = _problem(check)
+        if problem is not None:
+            self.add(problem)
+
+    def lines(self) -> Iterator[str]:
+        """The report as text."""
+        counts = ", ".join(f"{count:,} {name}" for name, count in self.counts.items())
+        yield f"{self.layout}: {counts}"
+        for rule, problems in sorted(self.problems.items(), key=lambda item: -item[1].count):
+            yield f"{problems.count:,} x {rule}"
+            yield from (f"    {example}" for example in problems.examples)
+            if problems.count > len(problems.examples):
+                yield f"    ... and {problems.count - len(problems.examples):,} more"
+        for note, count in self.notes.items():
+            yield f"note: {note}" if count == 1 else f"note: {count:,} x {note}"
+
+
+def check_data(
+    root: Path,
+    version: str | None = None,
+    labels: str | None = "auto",
+    fast: bool = False,
+    console: Console | None = None,
+) -> Report:
+    """Check all files of a data set and print what is missing or broken.
+
+    Args:
+        root: folder of the data set, in one of `LAYOUTS`.
+        version: table folder (nuScenes only).
+        labels: folder of pseudo labels, as ``data.labels``.
+        fast: read headers and sizes only.
+        console: where to print; standard output by default.
+
+    Raises:
+        FrameError: the layout is not known.
+    """
+    start_time = time.monotonic()
+    report = Report()
+    name = find_layout(root, version)
+    total, checks = LAYOUTS[name](root, version, labels, fast, report)
+    workers = os.cpu_count() or 1
+    with Progress("checking files", total, console=console) as progress, ThreadPoolExecutor(workers) as pool:
+        done, checks_start_time = 0, time.monotonic()
+        while batch := list(islice(checks, CHECKS_AT_ONCE)):
+            for problem in pool.map(_problem, batch):
+                done += 1
+                if problem is not None:
+                    report.add(problem)
+                rate = done / max(time.monotonic() - checks_start_time, 1e-9)
+                progress.update(done, f"{rate:.0f} files/s, {count_problems(report.num_problems)}")
+        for line in report.lines():
+            progress.message(line)
+        duration = format_duration(time.monotonic() - start_time)
+        read = f"{total:,} files{' (headers and sizes only)' if fast else ''}"
+        progress.message(f"{count_problems(report.num_problems)} in {read}, {duration}")
+    return report
+
+
+def count_problems(count: int) -> str:
+    """``no problem``, ``1 problem``, ``2 problems``."""
+    return f"{count:,} problem{'s' if count > 1 else ''}" if count else "no problem"
+
+
+def find_layout(root: Path, version: str | None = None) -> str:
+    """Name of the layout of a data set, a key of `LAYOUTS`.
+
+    Raises:
+        FrameError: there is none.
+    """
+    if not root.is_dir():
+        raise FrameError(root, "must be a folder, got no such folder")
+    if version is not None or any(path.is_dir() for path in root.glob("v1.0-*")):
+        return "nuscenes"
+    if any(root.glob(f"*/{own.DESCRIPTION}")):
+        return "folder"
+    raise FrameError(
+        root,
+        f"must hold nuScenes tables (v1.0-*/, or name them: --version) or drives (*/{own.DESCRIPTION}), got neither",
+    )
+
+
+def check_nuscenes(
+    root: Path, version: str | None, labels: str | None, fast: bool, report: Report
+) -> tuple[int, Iterator[Check]]:
+    """Tables, sweeps, keyframe images and their labels."""
+    tables = root / version if version else nuscenes.only_table_folder(root)
+    report.layout = f"nuScenes layout, {tables}"
+    for name in DEVKIT_TABLES:
+        if not (tables / f"{name}.json").is_file():
+            report.note(f"{tables / name}.json is missing: only the official devkit needs it")
+    index = nuscenes.build_index(tables, report.add)
+    sweeps, images = index.sweeps, index.images
+    label_files = _label_folder(root, labels, report)
+    scenes = set(index.recording.to_pylist())
+    report.attempt(partial(_check_splits, tables / "splits.json", scenes))
+    report.counts = {
+        "scenes": len(scenes),
+        "frames": len(index),
+        "sweeps": len(sweeps.path),
+        "images": len(images.path),
+        "boxes": len(index.boxes.name),
+    }
+    for frame in np.flatnonzero(index.sweep < 0):
+        report.add(nuscenes.no_keyframe(tables, str(index.token[frame])))
+    later = (sweeps.previous >= 0) & (sweeps.time_us <= sweeps.time_us[sweeps.previous])
+    for row in np.flatnonzero(later):
+        what = f"sweep {sweeps.path[row]} must be later than the one before it, got {sweeps.time_us[row]} us"
+        report.add(FrameError(tables / "sample_data.json", what))
+    starts = int(np.count_nonzero(sweeps.previous < 0))
+    if starts > len(scenes):
+        report.note(f"{starts:,} sweeps have none before them, but there are only {len(scenes):,} scenes")
+    if len(set(np.diff(images.offsets).tolist())) > 1:
+        report.note("some frames have fewer camera images than others")
+
+    def checks() -> Iterator[Check]:
+        for path in sweeps.path:
+            file = root / str(path)
+            yield partial(nuscenes.check_sweep_size, file) if fast else partial(_read, nuscenes.read_sweep, file)
+        for row, path in enumerate(images.path):
+            file = root / str(path)
+            channel = str(index.calibrations.channel[images.calibration[row]])
+            labels_of_camera = None if label_files is None else label_files / channel
+            size = int(images.width[row]), int(images.height[row])
+            yield from _image_checks(file, file.stem, *size, labels_of_camera, fast, report)
+
+    files_per_image = 1 if label_files is None else 2
+    return len(sweeps.path) + files_per_image * len(images.path), checks()
+
+
+def check_folder(
+    root: Path, version: str | None, labels: str | None, fast: bool, report: Report
+) -> tuple[int, Iterator[Check]]:
+    """Descriptions, poses, scans, images and their labels of own drives."""
+    report.layout = f"folder of drives, {root}"
+    label_files = _label_folder(root, labels, report)
+    folders = own.drive_folders(root)
+    report.attempt(partial(_check_splits, root / "splits.json", {path.name for path in folders}))
+    drives: list[own.Drive] = []
+    for path in folders:
+        report.attempt(lambda path=path: drives.append(own.read_drive(path)))  # type: ignore[misc]
+    scans = sum(len(drive.stems) for drive in drives)
+    images = sum(len(drive.stems) * len(drive.cameras) for drive in drives)
+    report.counts = {"drives": len(folders), "frames": scans, "images": images}
+    for drive in drives:
+        named = set(drive.stems.tolist())
+        extra = [file for file in (drive.folder / own.SCANS).glob(f"*{drive.suffix}") if file.stem not in named]
+        if extra:
+            report.note(f"{len(extra):,} scans of {drive.folder} are not used: {own.POSES} has no line for them")
+
+    def checks() -> Iterator[Check]:
+        for drive in drives:
+            for scan, stem in enumerate(drive.stems.tolist()):
+                file = drive.scan_file(scan)
+                check = partial(own.check_scan_header, file, drive.columns)
+                yield check if fast else partial(_read, own.read_scan, file, drive.columns)
+                for camera in drive.cameras:
+                    image = own.find_image_file(drive.folder / camera.name, stem)
+                    labels_of_camera = None if label_files is None else label_files / drive.folder.name / camera.name
+                    size = camera.width, camera.height
+                    yield from _image_checks(image, stem, *size, labels_of_camera, fast, report)
+
+    files_per_image = 1 if label_files is None else 2
+    return scans + files_per_image * images, checks()
+
+
+LAYOUTS: dict[str, Callable[[Path, str | None, str | None, bool, Report], tuple[int, Iterator[Check]]]] = {
+    "nuscenes": check_nuscenes,
+    "folder": check_folder,
+}
+"""By the name of `find_layout`. Each gets root, version, labels, whether to read headers only, and the report. It adds
+what concerns the data set as a whole to the report, and gives the number of files to check and a check for each."""
+
+
+def _read(read: Callable[..., object], *arguments: object) -> None:
+    read(*arguments)
+
+
+def _image_checks(
+    image: Path, stem: str, width: int, height: int, labels: Path | None, fast: bool, report: Report
+) -> Iterator[Check]:
+    """Image and, where ``labels`` is the folder of its camera, the label of it."""
+    yield partial(_check_image, image, width, height, labels is not None, fast, report)
+    if labels is not None:
+        yield partial(_check_label, labels, stem, width, height, fast)
+
+
+def _check_image(image: Path, width: int, height: int, required: bool, fast: bool, report: Report) -> None:
+    if not required and not image.is_file():
+        report.note("image is missing; training without labels does without")
+        return
+    check_image_header(image, width, height)
+    if not fast:
+        open_image(image)
+
+
+def _check_label(folder: Path, stem: str, width: int, height: int, fast: bool) -> None:
+    file = find_label_file(folder, stem)
+    if not fast:
+        PseudoLabel(file, width, height).class_map()
+    elif file.stat().st_size == 0:
+        raise FrameError(file, "label must be a readable file, got an empty one")
+
+
+def _check_splits(path: Path, recordings: set[str]) -> None:
+    if not path.is_file():
+        return
+    splits = read_json(path)
+    if not isinstance(splits, dict) or not all(isinstance(names, list) for names in splits.values()):
+        raise FrameError(path, "must map split names to lists of names, got something else")
+    unknown = sorted({str(name) for names in splits.values() for name in names} - recordings)
+    if unknown:
+        raise FrameError(path, f"must name recordings that are there, got {len(unknown)} others such as {unknown[0]}")
+
+
+def _label_folder(root: Path, labels: str | None, report: Report) -> Path | None:
+    try:
+        found = label_folder(root, labels)
+    except FrameError as problem:
+        report.add(problem)
+        return None
+    if found is None:
+        report.note("no pseudo labels: training will be LiDAR-only")
+    else:
+        report.note(f"pseudo labels: {found}")
+    return found
+
+
+def _problem(check: Check) -> FrameError | None:
+    try:
+        check()
+    except FrameError as problem:
+        return problem
+    except OSError as error:  # a folder that may not be read, a broken disk
+        return FrameError(error.filename or "?", f"must be readable, got {error.strerror}")
+    return None
