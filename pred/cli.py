@@ -39,21 +39,64 @@ def pretrain(arguments: list[str]) -> None:
 
 
 def evaluate(arguments: list[str]) -> None:
-    from pred.evaluate import evaluate_rendering
+    from argparse import ArgumentParser, RawDescriptionHelpFormatter
+
+    lines = [f"  {name:<10} {command.summary}" for name, command in EVALUATIONS.items()]
+    parser = ArgumentParser(
+        "pred evaluate",
+        usage="pred evaluate WHAT [options]    (pred evaluate WHAT --help for its options)",
+        description="\n".join(["Measure a run, or a file of predictions. WHAT is one of", *lines]),
+        formatter_class=RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("what", metavar="WHAT", choices=EVALUATIONS)
+    EVALUATIONS[parser.parse_args(arguments[:1]).what].function(arguments[1:])
+
+
+def evaluate_rendering(arguments: list[str]) -> None:
+    from pred.evaluate import evaluate_rendering as run_evaluation
 
     def add_options(parser: Any) -> None:
-        parser.add_argument("what", choices=["rendering"], help="rendering: depth and semantics of held-out returns")
         parser.add_argument(
             "--frames", type=int | None, default=None, help="evaluate only the first frames; all by default"
         )
 
     options, config = _options_of_run(
-        "pred evaluate",
+        "pred evaluate rendering",
         "Compare a run with held-out returns, with a simple baseline and with an untrained network.",
         arguments,
         add_options,
     )
-    evaluate_rendering(config, Path(options.folder), checkpoint=options.checkpoint, max_frames=options.frames)
+    run_evaluation(config, Path(options.folder), checkpoint=options.checkpoint, max_frames=options.frames)
+
+
+def evaluate_once(arguments: list[str]) -> None:
+    from argparse import ArgumentParser
+
+    parser = ArgumentParser(
+        "pred evaluate once",
+        description="Average precision of 3D boxes by the rules of the ONCE benchmark.",
+    )
+    parser.add_argument(
+        "predictions", type=Path, help="JSON list with an entry {frame_id, name, score, boxes_3d} per frame"
+    )
+    parser.add_argument(
+        "--truth", type=Path, required=True, help="root of a ONCE tree, or JSON list of {frame_id, name, boxes_3d}"
+    )
+    parser.add_argument("--split", help="list in ImageSets/ of the tree, such as val; all sequences by default")
+    parser.add_argument(
+        "--by", choices=("superclass", "class"), default="superclass", help="superclass: Car, Bus and Truck are Vehicle"
+    )
+    parser.add_argument(
+        "--iou",
+        choices=("official", "true"),
+        default="official",
+        help="official: as the devkit computes it, which turns boxes the wrong way; true: of the boxes as they are",
+    )
+    parser.add_argument("--output", type=Path, help="file to write; PREDICTIONS with _ap.json at its end by default")
+    options = parser.parse_args(arguments)
+    from pred.evaluate_once import evaluate_once as run_evaluation
+
+    run_evaluation(**vars(options))
 
 
 def view(arguments: list[str]) -> None:
@@ -113,7 +156,7 @@ def data(arguments: list[str]) -> None:
 
     parser = ArgumentParser("pred data", description="Go through a data set and tell what is missing or broken.")
     parser.add_argument("what", choices=["check"], help="check: every table and file; exit status 1 if one is broken")
-    parser.add_argument("root", metavar="ROOT", type=Path, help="folder in the nuScenes layout, or of own drives")
+    parser.add_argument("root", metavar="ROOT", type=Path, help="folder in the nuScenes or ONCE layout, or of drives")
     parser.add_argument("--version", default=None, help="table folder (nuScenes); the only v1.0-* by default")
     parser.add_argument("--labels", default="auto", help="folder of pseudo labels under ROOT, auto, or none")
     parser.add_argument("--fast", action="store_true", help="read headers and sizes only")
@@ -141,9 +184,14 @@ class Command(NamedTuple):
     summary: str
 
 
+EVALUATIONS = {
+    "rendering": Command(evaluate_rendering, "RUN: depth and semantics of held-out returns"),
+    "once": Command(evaluate_once, "PREDICTIONS: average precision of 3D boxes by the rules of the ONCE benchmark"),
+}
+
 COMMANDS = {
     "pretrain": Command(pretrain, "pre-train a LiDAR encoder; --resume RUN continues"),
-    "evaluate": Command(evaluate, "evaluate rendering RUN: errors on held-out returns"),
+    "evaluate": Command(evaluate, "evaluate rendering RUN: errors on held-out returns; once FILE: AP of 3D boxes"),
     "view": Command(view, "view RUN: pictures of what the run renders"),
     "world": Command(world, "make OUT: a data set of procedural towns in the nuScenes layout"),
     "data": Command(data, "data check ROOT: what is missing or broken in a data set"),

@@ -23,8 +23,8 @@ import numpy as np
 from rich.console import Console
 
 from pred.data import folder as own
-from pred.data import nuscenes
-from pred.data.frame import FrameError, check_image_header, open_image
+from pred.data import nuscenes, once
+from pred.data.frame import FrameError, check_image_header, open_image, rgb_image_size
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
 from pred.data.tables import read_json
 from pred.progress import Progress, format_duration
@@ -169,9 +169,12 @@ def find_layout(root: Path, version: str | None = None) -> str:
         return "nuscenes"
     if any(root.glob(f"*/{own.DESCRIPTION}")):
         return "folder"
+    if (root / "data").is_dir():
+        return "once"
     raise FrameError(
         root,
-        f"must hold nuScenes tables (v1.0-*/, or name them: --version) or drives (*/{own.DESCRIPTION}), got neither",
+        f"must hold nuScenes tables (v1.0-*/, or name them: --version), drives (*/{own.DESCRIPTION}) "
+        "or ONCE's sequences (data/), got none of them",
     )
 
 
@@ -259,9 +262,52 @@ def check_folder(
     return scans + files_per_image * images, checks()
 
 
+def check_once(
+    root: Path, version: str | None, labels: str | None, fast: bool, report: Report
+) -> tuple[int, Iterator[Check]]:
+    """Lists, JSON files, scans, images and their labels of ONCE."""
+    report.layout = f"ONCE layout, {root}"
+    label_files = _label_folder(root, labels, report)
+    names = once.sequence_names(root)
+    for split in sorted((root / "ImageSets").glob("*.txt")):
+        report.attempt(partial(_check_once_split, split, set(names)))
+    sequences: list[once.OnceSequence] = []
+    for name in names:
+        report.attempt(lambda name=name: sequences.append(once.read_sequence(root / "data" / name)))  # type: ignore[misc]
+    frames = sum(len(sequence.frame_ids) for sequence in sequences)
+    images = sum(len(sequence.frame_ids) * len(sequence.calibrations) for sequence in sequences)
+    annotations = [annotation for sequence in sequences for annotation in sequence.annotations.values()]
+    report.counts = {
+        "sequences": len(names),
+        "frames": frames,
+        "annotated frames": len(annotations),
+        "images": images,
+        "boxes": sum(len(annotation.names) for annotation in annotations),
+    }
+    without_pose = sum(int(np.count_nonzero(np.isnan(sequence.poses[:, 0]))) for sequence in sequences)
+    if without_pose:
+        report.note(f"{without_pose:,} frames have no pose; they are placed at the origin")
+
+    def checks() -> Iterator[Check]:
+        for sequence in sequences:
+            for frame_id in sequence.frame_ids.tolist():
+                scan = sequence.folder / once.LIDAR / f"{frame_id}.bin"
+                yield partial(once.check_scan_size, scan) if fast else partial(_read, once.read_scan, scan)
+                for camera in sequence.calibrations:
+                    image = sequence.folder / camera / f"{frame_id}.jpg"
+                    yield partial(_check_image, image, None, label_files is not None, fast, report)
+                    if label_files is not None:
+                        folder = label_files / sequence.folder.name / camera
+                        yield partial(_check_once_label, image, folder, fast)
+
+    files_per_image = 1 if label_files is None else 2
+    return frames + files_per_image * images, checks()
+
+
 LAYOUTS: dict[str, Callable[[Path, str | None, str | None, bool, Report], tuple[int, Iterator[Check]]]] = {
     "nuscenes": check_nuscenes,
     "folder": check_folder,
+    "once": check_once,
 }
 """By the name of `find_layout`. Each gets root, version, labels, whether to read headers only, and the report. It adds
 what concerns the data set as a whole to the report, and gives the number of files to check and a check for each."""
@@ -275,16 +321,19 @@ def _image_checks(
     image: Path, stem: str, width: int, height: int, labels: Path | None, fast: bool, report: Report
 ) -> Iterator[Check]:
     """Image and, where ``labels`` is the folder of its camera, the label of it."""
-    yield partial(_check_image, image, width, height, labels is not None, fast, report)
+    yield partial(_check_image, image, (width, height), labels is not None, fast, report)
     if labels is not None:
         yield partial(_check_label, labels, stem, width, height, fast)
 
 
-def _check_image(image: Path, width: int, height: int, required: bool, fast: bool, report: Report) -> None:
+def _check_image(image: Path, size: tuple[int, int] | None, required: bool, fast: bool, report: Report) -> None:
     if not required and not image.is_file():
         report.note("image is missing; training without labels does without")
         return
-    check_image_header(image, width, height)
+    if size is None:
+        rgb_image_size(image)
+    else:
+        check_image_header(image, *size)
     if not fast:
         open_image(image)
 
@@ -295,6 +344,20 @@ def _check_label(folder: Path, stem: str, width: int, height: int, fast: bool) -
         PseudoLabel(file, width, height).class_map()
     elif file.stat().st_size == 0:
         raise FrameError(file, "label must be a readable file, got an empty one")
+
+
+def _check_once_label(image: Path, folder: Path, fast: bool) -> None:
+    try:
+        width, height = rgb_image_size(image)
+    except FrameError:
+        return  # which the image's own check says
+    _check_label(folder, image.stem, width, height, fast)
+
+
+def _check_once_split(path: Path, sequences: set[str]) -> None:
+    unknown = sorted({*once.split_names(path.parents[1], path.stem)} - sequences)
+    if unknown:
+        raise FrameError(path, f"must name sequences that are there, got {len(unknown)} others such as {unknown[0]}")
 
 
 def _check_splits(path: Path, recordings: set[str]) -> None:

@@ -1,13 +1,16 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""Shared fixtures. Tests of real data read PRED_TEST_DATA, the folder that holds nuscenes_tiny/."""
+"""Shared fixtures. Tests of real data read PRED_TEST_DATA, the folder that holds nuscenes_tiny/; the test against the
+official ONCE evaluation reads PRED_TEST_FIXTURES, the folder that holds once_golden.json."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -84,3 +87,13 @@ def nuscenes_tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     linked = tmp_path_factory.mktemp("data") / root.name
     shutil.copytree(root.resolve(), linked, copy_function=os.symlink)
     return linked
+
+
+@pytest.fixture(scope="session")
+def once_golden() -> dict[str, Any]:
+    """Boxes, predictions and what the official ONCE evaluation makes of them."""
+    folder = os.environ.get("PRED_TEST_FIXTURES")
+    if not folder:
+        pytest.skip("PRED_TEST_FIXTURES is not set: no results of the official ONCE evaluation")
+    golden: dict[str, Any] = json.loads((Path(folder) / "once_golden.json").read_text())
+    return golden

@@ -192,7 +192,7 @@ def test_broken_folder(own: OwnTree) -> None:
 def test_layouts(tree: Tree, tmp_path_factory: pytest.TempPathFactory) -> None:
     assert find_layout(tree.root) == "nuscenes"
     empty = tmp_path_factory.mktemp("empty")
-    with pytest.raises(FrameError, match=r"must hold nuScenes tables .* or drives \(\*/drive\.yaml\), got neither"):
+    with pytest.raises(FrameError, match=r"must hold nuScenes tables .* drives .* or ONCE's sequences .*, got none"):
         find_layout(empty)
     with pytest.raises(FrameError, match="gone: must be a folder"):
         find_layout(empty / "gone")

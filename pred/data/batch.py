@@ -56,21 +56,24 @@ TensorHolder = TypeVar("TensorHolder", bound="Rays | Batch")
 class DataConfig:
     """What is read, what is hidden from the encoder, and how many rays are drawn."""
 
-    dataset: Literal["street", "nuscenes", "folder"] = "nuscenes"
-    """Procedural street, the official nuScenes layout under `root`, or a folder of own drives under `root`."""
+    dataset: Literal["street", "nuscenes", "once", "folder"] = "nuscenes"
+    """Procedural street, the official nuScenes or ONCE layout under `root`, or a folder of own drives under `root`."""
     root: str | None = None
     """Folder of the data set (not for the street)."""
     version: str | None = None
     """Table folder under `root` (nuscenes only); None: the only folder named like v1.0-*."""
     split: str | None = None
-    """Name in splits.json (nuscenes: the version's) or an official nuScenes split; None: every sample."""
+    """Name in splits.json (nuscenes: the version's), an official nuScenes split, or a list in ImageSets/ (once); None:
+    every sample."""
     info: str | None = None
     """Info file of OpenPCDet or mmdetection3d (nuscenes only): its samples, in its order, instead of a split."""
     sweeps: int = 10
-    """LiDAR sweeps per frame, the keyframe's own included; fewer where a scene starts."""
+    """LiDAR sweeps per frame, the keyframe's own included; fewer where a recording starts (nuscenes, folder)."""
     labels: str | None = "auto"
-    """Folder under `root` with <CAMERA>/<image stem>.png|.npy|.npz; auto: the only folder under
-    pseudo/; none (or no such folder): LiDAR-only. The street knows auto (exact labels) and none."""
+    """Folder under `root` with <CAMERA>/<image stem>.png|.npy|.npz (ONCE: <sequence>/<camera>/<frame id>.*); auto: the
+    only folder under pseudo/; none (or no such folder): LiDAR-only. The street knows auto (exact labels) and none."""
+    undistort: bool = True
+    """Undo the lens distortion of the calibration; False: the images have none any more (once only)."""
     batch_size: int = 4
     """Frames per batch and process."""
     mask_ratio: float = 0.95
@@ -357,6 +360,16 @@ def build_source(config: DataConfig) -> FrameSource:
         return StreetFrames(config.street, labels=config.labels not in ("none", None))
     if config.root is None:
         raise ValueError("data.root must name the folder of the data set, got None")
+    if config.dataset == "once":
+        from pred.data.once import OnceFrames
+
+        return OnceFrames(
+            config.root,
+            split=config.split,
+            labels=config.labels,
+            ego_box=config.ego_box,
+            undistort=config.undistort,
+        )
     if config.dataset == "folder":
         from pred.data.folder import FolderFrames
 

@@ -108,7 +108,7 @@ class Camera:
         if self.image is None:
             raise FrameError(f"camera {self.name}", "image must be given, got None")
         if isinstance(self.image, Path):
-            where, image = str(self.image), _read_rgb(self.image)
+            where, image = str(self.image), read_rgb(self.image)
         else:
             where = f"camera {self.name}"
             image = np.asarray(self.image() if callable(self.image) else self.image)
@@ -214,6 +214,42 @@ def invert_rigid(T_a_from_b: NDArray[np.float64]) -> NDArray[np.float64]:
     return inverse
 
 
+def pose_matrix(
+    translation_m: NDArray[np.float64],  # [3]
+    quaternion_wxyz: NDArray[np.float64],  # [4], of any length but 0
+) -> NDArray[np.float64]:
+    """[4, 4] rigid transform of a translation and a quaternion."""
+    w, x, y, z = quaternion_wxyz / np.linalg.norm(quaternion_wxyz)
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = translation_m
+    return matrix
+
+
+def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[4] unit quaternion w, x, y, z of a rotation matrix [3, 3], w >= 0.
+
+    4 q q^T is linear in the matrix; its longest column is q, up to length and sign, without any division by a small
+    number.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    outer = np.array(
+        [
+            [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
+            [zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx],
+            [xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy],
+            [yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz],
+        ]
+    )
+    column = outer[:, outer.diagonal().argmax()]
+    unit: NDArray[np.float64] = column / np.linalg.norm(column)
+    return -unit if unit[0] < 0 else unit
+
+
 def inside_range(points: NDArray[Any], point_range: tuple[float, ...]) -> NDArray[np.bool_]:
     """[N] mask of points (columns x, y, z, ...) in (x_min, y_min, z_min, x_max, y_max, z_max).
 
@@ -247,6 +283,19 @@ def open_image(path: Path, decode: bool = True) -> Image.Image:
     return image
 
 
+def rgb_image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file in pixels, from its header.
+
+    Raises:
+        FrameError: it is missing, no image, or not RGB.
+    """
+    with open_image(path, decode=False) as image:
+        size, mode = image.size, image.mode
+    if mode != "RGB":
+        raise FrameError(path, f"image must have mode RGB, got {mode}")
+    return size
+
+
 def check_image_header(path: Path, width: int, height: int) -> None:
     """Check size and mode of an image file without decoding it.
 
@@ -261,7 +310,8 @@ def check_image_header(path: Path, width: int, height: int) -> None:
         )
 
 
-def _read_rgb(path: Path) -> NDArray[np.uint8]:
+def read_rgb(path: Path) -> NDArray[np.uint8]:
+    """Decode an RGB image file, [height, width, 3]; raises as `open_image`, or where the mode is another."""
     with open_image(path) as image:
         if image.mode != "RGB":
             raise FrameError(path, f"image must have mode RGB, got {image.mode}")

@@ -66,8 +66,8 @@ def read_table(
     return kept
 
 
-def read_json(path: Path) -> Any:
-    """Content of a small JSON file.
+def read_json(path: Path, what: str = "table") -> Any:
+    """Content of a small JSON file; ``what`` names it in error texts.
 
     Raises:
         FrameError: it is missing or no JSON.
@@ -75,9 +75,9 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise _unreadable(path, error) from None
-    except ValueError as error:
-        raise _no_json(path, error) from None
+        raise _unreadable(path, error, what) from None
+    except (ValueError, RecursionError) as error:
+        raise _no_json(path, error, what) from None
 
 
 def iterate_rows(path: Path, advance: Callable[[int], None] | None = None) -> Iterator[Row]:
@@ -157,11 +157,11 @@ def _rows(path: Path, read: Callable[[int], str], advance: Callable[[int], None]
         raise broken("Extra data", dropped + position)
 
 
-def _unreadable(path: Path, error: OSError) -> FrameError:
+def _unreadable(path: Path, error: OSError, what: str = "table") -> FrameError:
     if isinstance(error, FileNotFoundError):
-        return FrameError(path, "table must exist, got no such file")
-    return FrameError(path, f"table must be readable, got {error}")
+        return FrameError(path, f"{what} must exist, got no such file")
+    return FrameError(path, f"{what} must be readable, got {error}")
 
 
-def _no_json(path: Path, what: object) -> FrameError:
-    return FrameError(path, f"table must be valid JSON, got {what}")
+def _no_json(path: Path, error: object, what: str = "table") -> FrameError:
+    return FrameError(path, f"{what} must be valid JSON, got {error}")
