@@ -101,16 +101,16 @@ def without_overlaps(
         ego: motion of the ego car.
         ego_size_m: its length and width.
         times_us: [T] when to look.
-        margin_m: distance that all keep, on top of the boxes' own margin.
+        margin_m: that much larger on all sides counts what moves, on top of the boxes' own margin.
     """
     tracks = [ego.placements(times_us)]
-    halves = [0.5 * np.array(ego_size_m) + margin_m]
+    halves = [0.5 * np.array(ego_size_m) + 0.5 * margin_m]
     kept: list[Actor] = []
     for unit in units:
         unit_tracks, unit_halves = [], []
         for actor in unit:
             unit_tracks.append(actor.motion.placements(times_us[:1] if actor.is_static else times_us))
-            unit_halves.append(0.5 * np.array(actor.size_lwh_m[:2]) + 0.5 * margin_m)
+            unit_halves.append(0.5 * np.array(actor.size_lwh_m[:2]) + (0.0 if actor.is_static else margin_m))
         clear = all(
             not _meet(track, half, other_track, other_half)
             for track, half in zip(unit_tracks, unit_halves, strict=True)

@@ -127,7 +127,7 @@ def _lots(rng: np.random.Generator, plan: Plan, stretch: Stretch) -> Iterator[Me
     taken = [park.along for park in plan.car_parks if _same(park.stretch, stretch)]
     if _same(plan.first, stretch):
         taken.append(plan.site)
-    urban = rng.uniform(0.35, 0.8)
+    urban = rng.uniform(0.5, 0.9)
     along = low
     while True:
         draw = rng.random()
@@ -162,7 +162,7 @@ def _lot(
 ) -> Iterator[Mesh]:
     front_m = _front_m(stretch)
     if draw < urban:
-        block = objects.apartment_block(rng, width_m - 0.5, rng.uniform(10.0, 13.0))
+        block = objects.apartment_block(rng, width_m - 0.5, rng.uniform(10.0, 13.0), (4, 9))
         yield _put(block, stretch, along, front_m + rng.uniform(0.0, 1.2), TERRAIN_Z_M, _FACING_ROAD)
         return
     boundary = (objects.hedge, objects.fence, objects.wall)[int(rng.integers(3))]
@@ -195,7 +195,8 @@ def _furniture(rng: np.random.Generator, plan: Plan, stretch: Stretch) -> Iterat
     if rng.random() < 0.7:
         spacing_m = rng.uniform(9.0, 15.0)
         for along in free(np.arange(low + rng.uniform(3.0, spacing_m), high - 3.0, spacing_m)):
-            yield _put(objects.broadleaf(rng), stretch, along, kerb_m + 0.2, KERB_Z_M, rng.uniform(0, 6))
+            tree = objects.broadleaf(rng).turned(np.eye(3) * rng.uniform(1.0, 1.5))
+            yield _put(tree, stretch, along, kerb_m + 0.2, KERB_Z_M, rng.uniform(0, 6))
     for along in free(rng.uniform(low, high, 3)):
         yield _put(objects.traffic_sign(rng), stretch, along, kerb_m, KERB_Z_M, np.pi)
     if plan.layout.is_junction(stretch.b):
@@ -211,9 +212,10 @@ def _green(rng: np.random.Generator, plan: Plan) -> Iterator[Mesh]:
         low, high = np.maximum(block.low, -10.0) + margin_m, np.minimum(block.high, EXTENT_M + 10.0) - margin_m
         if (high - low).min() < 1.0 or not plan.near(0.5 * (low + high)[None], BUILT_M)[0]:
             continue
-        count = min(int((high - low).prod() / 70.0) + 1, 14)
+        count = min(int((high - low).prod() / 40.0) + 1, 24)
         depth = high - low
         if not block.inner and depth.min() > 25.0:
             continue  # gardens of the lots along the rim
         for x, y in low + rng.uniform(0, 1, (count, 2)) * depth:
-            yield (objects.broadleaf if rng.random() < 0.7 else objects.conifer)(rng).moved(x, y, TERRAIN_Z_M)
+            tree = (objects.broadleaf if rng.random() < 0.7 else objects.conifer)(rng)
+            yield tree.turned(np.eye(3) * rng.uniform(1.0, 1.8)).moved(x, y, TERRAIN_Z_M)

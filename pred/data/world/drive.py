@@ -18,7 +18,7 @@ from pred.data.frame import Camera, invert_rigid
 from pred.data.world import blocks, sensors
 from pred.data.world.actors import Actor
 from pred.data.world.meshes import Material, boxes, loft, merge
-from pred.data.world.moment import Layer, Surfaces, cover, moving_layer
+from pred.data.world.moment import Layer, Sector, Surfaces, cover, moving_layer
 from pred.data.world.motion import rigid
 from pred.data.world.objects import CLASS_IDS
 from pred.data.world.population import draw_plan, populate
@@ -55,10 +55,14 @@ ANNOTATED_M = 80.0
 SEEN_M = 150.0
 """Moving actors that are farther away are not drawn."""
 
+_GRID = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+_MEMORY_US = 1_000_000
 _EPOCH_US = 1_600_000_000_000_000
 _SCENE_STRIDE_US = 600_000_000
 _LEAD_US, _TAIL_US = 2_000_000, 200_000
 """The simulation starts so long before the first keyframe and ends so long after the last."""
+_SHADOW_M = 6.0
+"""Moving actors that far outside a picture are drawn, too: their shadows may be in it."""
 _SLICES = 8
 """Moving actors are placed anew that often during a revolution."""
 _BACKGROUND = {
@@ -164,9 +168,32 @@ class Drive:
         return rigid(x, y, 0.0, yaw_rad)
 
     def annotated(self, time_us: int) -> list[Actor]:
-        """Actors within `ANNOTATED_M` of the ego car, whether or not it can see them."""
+        """Actors that annotators would mark: within `ANNOTATED_M` of the ego car, and in sight of the LiDAR's place
+        now or one second earlier or later.
+
+        Moving actors hide nothing here, and in sight is what shows any part, however few points there are.
+        """
         ego = self.T_world_from_ego(time_us)[:2, 3]
-        return [actor for actor in self.actors if np.linalg.norm(actor.pose(time_us)[:2, 3] - ego) < ANNOTATED_M]
+        near = [actor for actor in self.actors if np.linalg.norm(actor.pose(time_us)[:2, 3] - ego) < ANNOTATED_M]
+        seen = np.zeros(len(near), dtype=np.bool_)
+        for offset_us in (0, -_MEMORY_US, _MEMORY_US):
+            if self.start_us <= time_us + offset_us <= self.end_us:
+                seen |= self._in_sight(near, time_us + offset_us)
+        return [actor for actor, visible in zip(near, seen, strict=True) if visible]
+
+    def _in_sight(self, actors: list[Actor], time_us: int) -> NDArray[np.bool_]:
+        """[len(actors)] whether a ray from the LiDAR to any of 27 places in the box meets nothing still before."""
+        if not actors:
+            return np.zeros(0, dtype=np.bool_)
+        origin = (self.T_world_from_ego(time_us) @ sensors.T_EGO_FROM_LIDAR)[:3, 3]
+        poses = np.array([actor.pose(time_us) for actor in actors])
+        sizes = np.array([actor.size_lwh_m for actor in actors])
+        places = (0.42 * _GRID[None] * sizes[:, None]) @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+        sight = (places - origin).reshape(-1, 3)
+        distance_m = np.linalg.norm(sight, axis=1, keepdims=True)
+        hits = self._still.cast(origin.astype(np.float32), (sight / distance_m).astype(np.float32))
+        own = hits.instance == np.repeat([actor.instance for actor in actors], len(_GRID))
+        return np.asarray(((hits.t_m > distance_m[:, 0]) | own).reshape(len(actors), -1).any(axis=1))
 
     def scan(self, time_us: int) -> Sweep:
         """The LiDAR revolution that ends at ``time_us``."""
@@ -177,11 +204,15 @@ class Drive:
         origins, directions = self._beams_in_world(times_us)
         origins32, directions32 = origins.astype(np.float32), directions.astype(np.float32)
         hits = self._still.cast(origins32, directions32)
-        for columns in np.array_split(np.arange(NUM_COLUMNS), _SLICES):
-            middle = columns[len(columns) // 2]
-            layer = self._moving_layer(int(times_us[middle]), MAX_RANGE_M + 15.0)
+        slices = np.array_split(np.arange(NUM_COLUMNS), _SLICES)
+        middles = [int(columns[len(columns) // 2]) for columns in slices]
+        placements = self._mover_placements(times_us[middles])
+        for columns, middle, at_middle in zip(slices, middles, placements, strict=True):
+            rays = slice(int(columns[0]) * NUM_RINGS, (int(columns[-1]) + 1) * NUM_RINGS)
+            ahead = directions[middle * NUM_RINGS]
+            sector = Sector(float(np.arctan2(ahead[1], ahead[0])), 1.1 * np.pi / _SLICES, 0.5)
+            layer = moving_layer(self._movers, at_middle, origins[middle * NUM_RINGS, :2], MAX_RANGE_M, sector)
             if layer is not None:
-                rays = slice(int(columns[0]) * NUM_RINGS, (int(columns[-1]) + 1) * NUM_RINGS)
                 cover(hits, layer, origins32, directions32, rays)
         # Drawn for all beams, so that a beam's noise does not depend on what the others meet.
         noise_m, chance, speckle, glint = (
@@ -226,7 +257,11 @@ class Drive:
         T_world_from_lidar = self.T_world_from_ego(time_us) @ sensors.T_EGO_FROM_LIDAR
         origin, directions = sensors.camera_rays(camera, T_world_from_lidar)
         hits = self._still.cast(origin, directions)
-        moving = self._moving_layer(time_us, SEEN_M)
+        optical_axis = (T_world_from_lidar @ camera.T_lidar_from_camera)[:3, 2].astype(np.float32)
+        half_rad = float(np.arccos((directions @ optical_axis).min()))
+        sector = Sector(float(np.arctan2(optical_axis[1], optical_axis[0])), half_rad, _SHADOW_M)
+        (placements,) = self._mover_placements(np.array([time_us]))
+        moving = moving_layer(self._movers, placements, origin[:2], SEEN_M, sector)
         if moving is not None:
             cover(hits, moving, origin, directions, slice(None))
 
@@ -241,7 +276,6 @@ class Drive:
         pixels = sensors.shade(
             origin, directions, solid, hits.t_m[solid], hits.normal[solid], hits.colour[solid], self.sun, occluded
         )
-        optical_axis = (T_world_from_lidar @ camera.T_lidar_from_camera)[:3, 2].astype(np.float32)
         return View(
             pixels.reshape(height, width, 3),
             hits.class_id.reshape(height, width),
@@ -279,8 +313,10 @@ class Drive:
         centres = np.stack([x + ahead_m * np.cos(yaw_rad), y + ahead_m * np.sin(yaw_rad), 0 * x + height_m], axis=1)
         return np.repeat(centres, NUM_RINGS, axis=0), directions.reshape(-1, 3)
 
-    def _moving_layer(self, time_us: int, within_m: float) -> Layer | None:
-        return moving_layer(self._movers, time_us, self.T_world_from_ego(time_us)[:2, 3], within_m)
+    def _mover_placements(self, times_us: NDArray[np.int64]) -> NDArray[np.float64]:
+        """[n, M, 4] of all that moves."""
+        tracks = [actor.motion.placements(times_us) for actor in self._movers]
+        return np.array(tracks).reshape(-1, len(times_us), 4).transpose(1, 0, 2)
 
     @cached_property
     def _still(self) -> Layer:
@@ -316,7 +352,7 @@ def ego_range_m() -> NDArray[np.float32]:
     grey = Material(NO_CLASS, (0.5, 0.5, 0.5), 0.3)
     car = merge(
         [
-            boxes([-0.55, -0.80, -0.45], [0.55, 0.30, -0.30], grey),
+            boxes([-0.55, -0.72, -0.45], [0.55, 0.26, -0.31], grey),
             boxes([-0.12, -1.1, -0.40], [0.12, -0.75, -0.31], grey),
             loft((-0.62, 0.62, 1.0, 2.0), (-0.60, 0.60, 1.1, 1.85), -1.1, -0.93, grey),
         ]

@@ -64,27 +64,56 @@ class Layer:
         )
 
 
-def moving_layer(actors: Sequence[Actor], time_us: int, around: NDArray[np.float64], within_m: float) -> Layer | None:
-    """What moves within a distance of the point ``around`` [2] at a time; None if nothing does."""
-    found = []
-    for actor in actors:
-        x, y, z, yaw_rad = actor.motion.placements(np.array([time_us]))[0]
-        if np.hypot(x - around[0], y - around[1]) < within_m:
-            found.append((actor, rigid(x, y, z + actor.lift_m, yaw_rad)))
-    return Layer(None, found) if found else None
+class Sector(NamedTuple):
+    """Which directions in the plane count: ``heading_rad`` give or take ``half_rad``; ``margin_m`` on top."""
+
+    heading_rad: float
+    half_rad: float
+    margin_m: float
 
 
-def cover(below: Surfaces, layer: Layer, origins: NDArray[np.float32], directions: NDArray[np.float32], rays: slice) -> None:
+def moving_layer(
+    actors: Sequence[Actor],
+    placements: NDArray[np.float64],  # [M, 4] of the actors on the ground: x, y, z, heading
+    viewer: NDArray[np.float64],  # [2]
+    within_m: float,
+    sector: Sector,
+) -> Layer | None:
+    """The actors that somebody at ``viewer`` can meet within a distance, looking into a sector; None if there is none.
+
+    Those that only touch the sector belong to it, as does what stands right beside the viewer.
+    """
+    offset = placements[:, :2] - viewer
+    distance_m = np.hypot(*offset.T)
+    reach_m = np.array([0.5 * np.hypot(*actor.size_lwh_m[:2]) for actor in actors]) + sector.margin_m
+    bearing = np.arctan2(offset[:, 1], offset[:, 0]) - sector.heading_rad
+    bearing = np.abs((bearing + np.pi) % (2 * np.pi) - np.pi)
+    widened = sector.half_rad + np.arcsin(np.minimum(reach_m / np.maximum(distance_m, reach_m), 1.0))
+    found = np.flatnonzero((distance_m < within_m) & (bearing < widened))
+    if len(found) == 0:
+        return None
+    return Layer(
+        None,
+        [
+            (actors[k], rigid(x, y, z + actors[k].lift_m, yaw_rad))
+            for k, (x, y, z, yaw_rad) in zip(found, placements[found], strict=True)
+        ],
+    )
+
+
+def cover(
+    below: Surfaces, layer: Layer, origins: NDArray[np.float32], directions: NDArray[np.float32], rays: slice
+) -> None:
     """Replace hits ``below`` by those of ``layer`` that are nearer, for a slice of the rays."""
     directions = directions[rays]
-    origins = origins[rays] if origins.ndim == 2 else origins
-    hits = layer.scene.cast(origins, directions)
-    (nearer,) = np.nonzero(hits.t_m < below.t_m[rays])
-    face = hits.face[nearer]
+    t_m, face = layer.scene.first(origins[rays] if origins.ndim == 2 else origins, directions)
+    (nearer,) = np.nonzero(t_m < below.t_m[rays])
+    face = face[nearer]
+    hits = layer.scene.hits(t_m[nearer], face, directions[nearer])
     for target, values in (
-        (below.t_m, hits.t_m[nearer]),
-        (below.class_id, hits.class_id[nearer]),
-        (below.normal, hits.normal[nearer]),
+        (below.t_m, hits.t_m),
+        (below.class_id, hits.class_id),
+        (below.normal, hits.normal),
         (below.colour, layer.scene.colours[face]),
         (below.reflectance, layer.scene.reflectances[face]),
         (below.instance, layer.instances[face]),

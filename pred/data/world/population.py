@@ -166,7 +166,7 @@ def _site(rng: np.random.Generator, plan: Plan) -> Iterator[Unit]:
     """Building site: barriers and cones in the parking strip, machines and workers behind the walkway."""
     stretch, (low, high) = plan.first, plan.site
     edge = stretch.lanes * LANE_M
-    for along in np.arange(low + 1.6, high - 1.4, 2.15):
+    for along in np.arange(low + 1.6, high - 1.0, 2.2):
         yield _standing(rng, "barrier", stretch, along, edge + 0.5, np.pi / 2 + rng.normal(0, 0.03))
     for step in range(4):
         for along in (low - 0.2 - 1.1 * step, high + 0.2 + 1.1 * step):
@@ -277,9 +277,11 @@ def _crossing_people(
 ) -> Iterator[Unit]:
     """People on the zebra crossing before node b; notes in ``crossings`` when they are on the road."""
     ego_waits = (stretch.a, stretch.b) == (plan.first.a, plan.first.b)
-    if not ego_waits and rng.random() > 0.4:
+    # Nobody crosses where the ego car leaves a junction, or it might wait there for most of the drive.
+    leaving = {(lane.key[2], lane.key[1]) for lane in plan.route.sections[2:6:2]}
+    if not ego_waits and ((stretch.a, stretch.b) in leaving or rng.random() > 0.4):
         return
-    begin_s = rng.uniform(2.0, 4.0) if ego_waits else rng.uniform(0.0, max(duration_s - 8.0, 1.0))
+    begin_s = rng.uniform(0.5, 2.0) if ego_waits else rng.uniform(0.0, max(duration_s - 8.0, 1.0))
     along_low, along_high = zebra(stretch)
     for along in np.linspace(along_low + 0.6, along_high - 0.6, int(rng.integers(1, 4))):
         side = 1 if rng.random() < 0.5 else -1
@@ -287,7 +289,7 @@ def _crossing_people(
         across = side * np.array([outside, kerb + 0.1, kerb - 0.1, -kerb + 0.1, -kerb - 0.1, -outside])
         heights = [KERB_Z_M, KERB_Z_M, 0.0, 0.0, KERB_Z_M, KERB_Z_M]
         path = Path(np.column_stack([stretch.place(np.full(6, along), across), heights]))
-        speed_mps, set_out_s = rng.uniform(1.1, 1.6), begin_s + rng.uniform(0.0, 1.0)
+        speed_mps, set_out_s = rng.uniform(1.3, 1.9), begin_s + rng.uniform(0.0, 1.0)
         yield [_walker(rng, "adult", path, start_us, set_out_s, speed_mps)]
         on_road = (set_out_s, set_out_s + path.length_m / speed_mps)
         crossings.setdefault((stretch.a, stretch.b), []).append(on_road)

@@ -21,8 +21,8 @@ STEP_S = 0.1
 ACCELERATION_MPS2, BRAKING_MPS2, HARDEST_MPS2 = 1.6, 2.2, 6.0
 STANDING_GAP_M, HEADWAY_S = 2.0, 1.1
 LOOK_AHEAD_M = 50.0
-CLEAR_S = 7.0
-"""Zebra crossings must stay free for that long before a vehicle enters a junction."""
+NEAR_CLEAR_S, FAR_CLEAR_S = 4.0, (1.5, 8.0)
+"""When zebra crossings must stay free: seconds from entering a junction, on its near and its far side."""
 PATIENCE_S = 4.0
 """Vehicles let the cars behind one another pass for that long before it is their turn."""
 
@@ -182,10 +182,11 @@ def _grant(
         if holders and any(waiting) and time_s - asked_s <= PATIENCE_S:
             continue
         leaving = state.sections[state.section + 2].key
-        zebras = ((approach, node), (leaving[2], node))
+        # The crossing on this side is passed at once, the one on the other side some seconds later.
+        zebras = (((approach, node), 0.0, NEAR_CLEAR_S), ((leaving[2], node), FAR_CLEAR_S[0], FAR_CLEAR_S[1]))
         if any(
-            begin < time_s + CLEAR_S and time_s < end
-            for zebra in zebras
+            begin < time_s + until_s and time_s + from_s < end
+            for zebra, from_s, until_s in zebras
             for begin, end in crossings.get(zebra, ())  # type: ignore[call-overload]
         ):
             continue
