@@ -87,7 +87,7 @@ def draw_plan(rng: np.random.Generator, layout: Layout, duration_s: float) -> Pl
     first = starts[int(rng.integers(len(starts)))]
     lane = int(rng.integers(first.lanes))
     # The route reaches beyond what the ego car can see along its way; most of it is never driven.
-    route = draw_route(layout, rng, (first.a, first.b, lane), 12.0 * duration_s + 60.0, turn_within=2)
+    route = draw_route(layout, rng, (first.a, first.b, lane), 12.0 * duration_s + 60.0, turn_within=1)
     lane_m = float(route.starts_m[1])
     front_m = max(lane_m - rng.uniform(36.0, 44.0), EGO_SIZE_M[0] + 1.0)
     driven = route.path.at(np.arange(0.0, front_m + 8.0 * duration_s + 10.0, 4.0))[:, :2]
@@ -134,7 +134,7 @@ def populate(
         if plan.layout.is_junction(stretch.b):
             walkers += _crossing_people(rng, plan, stretch, start_us, duration_s, crossings)
     drivers, trains = _draw_traffic(rng, plan, stretches, duration_s)
-    ego_driver = Driver(plan.route, EGO_SIZE_M[0], plan.front_m, rng.uniform(8.5, 11.0), rng.uniform(0.8, 2.5))
+    ego_driver = Driver(plan.route, EGO_SIZE_M[0], plan.front_m, rng.uniform(9.0, 11.5), rng.uniform(0.5, 1.5), True)
     profiles = simulate([ego_driver, *drivers], plan.layout, crossings, start_us, duration_s)
     ego = Travel(plan.route.path, profiles[0], *EGO_AXLES_M)
     for driver, train, profile in zip(drivers, trains, profiles[1:], strict=True):
@@ -279,9 +279,11 @@ def _crossing_people(
     ego_waits = (stretch.a, stretch.b) == (plan.first.a, plan.first.b)
     # Nobody crosses where the ego car leaves a junction, or it might wait there for most of the drive.
     leaving = {(lane.key[2], lane.key[1]) for lane in plan.route.sections[2:6:2]}
+    if ego_waits and stretch.lanes > 1:
+        return
     if not ego_waits and ((stretch.a, stretch.b) in leaving or rng.random() > 0.4):
         return
-    begin_s = rng.uniform(0.5, 2.0) if ego_waits else rng.uniform(0.0, max(duration_s - 8.0, 1.0))
+    begin_s = rng.uniform(0.0, 1.5) if ego_waits else rng.uniform(0.0, max(duration_s - 8.0, 1.0))
     along_low, along_high = zebra(stretch)
     for along in np.linspace(along_low + 0.6, along_high - 0.6, int(rng.integers(1, 4))):
         side = 1 if rng.random() < 0.5 else -1
@@ -316,7 +318,7 @@ def _draw_traffic(
                 length_m = sum(_length_m(mesh) for _, mesh, _ in train) + DRAWBAR_GAP_M * (len(train) - 1)
                 desired = rng.uniform(4.0, 5.5) if kind == "cyclist" else rng.uniform(7.5, 12.0)
                 is_ego_lane = lane_section(stretch, lane).key == ego_key
-                free = not is_ego_lane or front_m < plan.front_m - 14.0 or front_m - length_m > plan.front_m + 9.0
+                free = not is_ego_lane or front_m < plan.front_m - 14.0
                 start = (stretch.a, stretch.b, lane)
                 route = draw_route(plan.layout, rng, start, front_m + 12.0 * duration_s + 30.0)
                 if free and rng.random() < 0.42 and front_m > length_m:

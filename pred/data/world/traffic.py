@@ -18,7 +18,7 @@ from pred.data.world.motion import Profile
 from pred.data.world.town import Layout, Node
 
 STEP_S = 0.1
-ACCELERATION_MPS2, BRAKING_MPS2, HARDEST_MPS2 = 1.6, 2.2, 6.0
+ACCELERATION_MPS2, BRAKING_MPS2, HARDEST_MPS2 = 2.2, 3.0, 6.0
 STANDING_GAP_M, HEADWAY_S = 2.0, 1.1
 LOOK_AHEAD_M = 50.0
 NEAR_CLEAR_S, FAR_CLEAR_S = 4.0, (1.5, 8.0)
@@ -39,7 +39,8 @@ class Driver:
         length_m: from its front to its end.
         front_m: of its front on the route, at least ``length_m``.
         desired_mps: speed on a free road.
-        hold_s: how long it stands at its first junction at least.
+        hold_s: how long it stands before its first junction at least.
+        has_priority: once it has stood, other approaches of the junction ahead of it wait.
     """
 
     route: Route
@@ -47,6 +48,7 @@ class Driver:
     front_m: float
     desired_mps: float
     hold_s: float = 0.0
+    has_priority: bool = False
 
 
 class _State:
@@ -155,6 +157,7 @@ def _grant(
 ) -> None:
     """Let vehicles into junctions, those first that have asked first."""
     asking = []
+    preferred: dict[Node, Node] = {}
     for order, state in enumerate(states):
         following = state.section + 1
         if following >= len(state.sections) or following <= state.granted or not _is_guarded(state, following, layout):
@@ -162,15 +165,24 @@ def _grant(
         distance = state.starts[following] - state.front
         if state.hold_s > 0:
             # The first stop of somebody who has to stop: time runs once it stands.
-            if state.speed < 0.3 and distance < 4.0:
+            if state.speed < 0.3:
                 state.hold_s -= STEP_S
-        elif distance < state.speed**2 / (2 * BRAKING_MPS2) + 12.0:
+            continue
+        if state.driver.has_priority and distance < LOOK_AHEAD_M:
+            preferred[state.sections[following].node] = state.sections[following].approach  # type: ignore[index]
+        # Nobody asks from behind somebody who has not been let in yet.
+        offset = state.front - state.starts[state.section]
+        on_lane = occupants.get(state.sections[state.section].key, ())
+        is_first = all(front <= offset or other.held == state.sections[following].node for _, front, other in on_lane)
+        if is_first and distance < state.speed**2 / (2 * BRAKING_MPS2) + 12.0:
             state.asked_s = time_s if state.asked_s is None else state.asked_s
             asking.append((state.asked_s, order, state))
     for asked_s, _, state in sorted(asking, key=lambda entry: entry[:2]):
         section = state.sections[state.section + 1]
         node, approach = section.node, section.approach
         assert node is not None
+        if preferred.get(node, approach) != approach:
+            continue
         holders = [other for other in states if other.held == node]
         if any(other.sections[other.granted].approach != approach for other in holders):
             continue
