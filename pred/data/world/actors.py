@@ -133,6 +133,4 @@ def _meet(
         return False
     count = max(len(track), len(other))
     track, other = (np.broadcast_to(rows, (count, 4))[near] for rows in (track, other))
-    return bool(
-        overlap(track, np.tile(half, (len(near), 1)), other, np.tile(other_half, (len(near), 1))).any()
-    )
+    return bool(overlap(track, np.tile(half, (len(near), 1)), other, np.tile(other_half, (len(near), 1))).any())

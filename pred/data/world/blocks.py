@@ -22,6 +22,7 @@ from pred.data.world.town import (
     TERRAIN_Z_M,
     CarPark,
     Layout,
+    Node,
     Stretch,
     lane_range,
     stop_line,
@@ -49,6 +50,7 @@ def build(plan: Plan, seed: int, index: int) -> Mesh:
             meshes += _lots(rng, plan, stretch)
             meshes += _furniture(rng, plan, stretch)
     rng = numpy_generator(seed, "drive", index, "green")
+    meshes += _street_ends(rng, plan)
     meshes += _green(rng, plan)
     meshes.append(objects.woods(rng, 260.0, 330.0, 90).moved(EXTENT_M / 2, EXTENT_M / 2))
     return merge(meshes)
@@ -121,9 +123,8 @@ def _put(mesh: Mesh, stretch: Stretch, along: float, right: float, z: float, tur
 
 def _lots(rng: np.random.Generator, plan: Plan, stretch: Stretch) -> Iterator[Mesh]:
     """Apartment blocks, houses with front gardens and small parks in a row on the right of a stretch."""
-    # Those along y leave the corners to those along x.
-    corner_m = 1.0 if abs(stretch.ahead[0]) > 0.5 else CORNER_LOT_M
-    low, high = stretch.kerb_a_m + SIDEWALK_M + corner_m, stretch.kerb_b_m - SIDEWALK_M - corner_m
+    low = stretch.kerb_a_m + SIDEWALK_M + _corner_m(plan.layout, stretch, stretch.a)
+    high = stretch.kerb_b_m - SIDEWALK_M - _corner_m(plan.layout, stretch, stretch.b)
     taken = [park.along for park in plan.car_parks if _same(park.stretch, stretch)]
     if _same(plan.first, stretch):
         taken.append(plan.site)
@@ -137,15 +138,30 @@ def _lots(rng: np.random.Generator, plan: Plan, stretch: Stretch) -> Iterator[Me
                 # What is left before a car park or a building site is fenced.
                 if begin - 1.0 - along > 3.0:
                     boundary = objects.fence(rng, begin - 1.5 - along)
-                    yield _put(boundary, stretch, 0.5 * (along + begin - 1.0), _front_m(stretch), TERRAIN_Z_M, _FACING_ROAD)
+                    yield _put(
+                        boundary, stretch, 0.5 * (along + begin - 1.0), _front_m(stretch), TERRAIN_Z_M, _FACING_ROAD
+                    )
                 along = end + 1.0
         if along + width_m > high:
             break
         yield from _lot(rng, stretch, along + width_m / 2, width_m, draw, urban)
         along += width_m + rng.uniform(0.5, 2.5)
     if high - along > 3.0:
-        yield _put(objects.hedge(rng, high - along), stretch, 0.5 * (along + high), _front_m(stretch), TERRAIN_Z_M, _FACING_ROAD)
+        yield _put(
+            objects.hedge(rng, high - along),
+            stretch,
+            0.5 * (along + high),
+            _front_m(stretch),
+            TERRAIN_Z_M,
+            _FACING_ROAD,
+        )
         yield _put(objects.broadleaf(rng), stretch, 0.5 * (along + high), _front_m(stretch) + 4.0, TERRAIN_Z_M)
+
+
+def _corner_m(layout: Layout, stretch: Stretch, node: Node) -> float:
+    """Room before a corner: lots along y leave it to those along x, if there are any."""
+    right = (node[0] + round(stretch.ahead[1]), node[1] - round(stretch.ahead[0]))
+    return CORNER_LOT_M if abs(stretch.ahead[1]) > 0.5 and layout.has_road(node, right) else 1.0
 
 
 def _front_m(stretch: Stretch) -> float:
@@ -203,6 +219,21 @@ def _furniture(rng: np.random.Generator, plan: Plan, stretch: Stretch) -> Iterat
         yield _put(objects.traffic_light(rng), stretch, sum(stop_line(stretch)) / 2, kerb_m, KERB_Z_M, np.pi)
     else:
         yield _put(objects.traffic_sign(rng), stretch, high, kerb_m, KERB_Z_M, np.pi)
+
+
+def _street_ends(rng: np.random.Generator, plan: Plan) -> Iterator[Mesh]:
+    """Houses that look down the road at T-junctions and bends, where a fourth road is missing."""
+    for i, j in plan.layout.nodes:
+        for step_x, step_y in ((1, 0), (0, 1), (-1, 0), (0, -1)):
+            if plan.layout.has_road((i, j), (i + step_x, j + step_y)):
+                continue
+            column, row = plan.layout.columns[i], plan.layout.rows[j]
+            kerb_m, half_m = (column.half_m, row.half_m) if step_x else (row.half_m, column.half_m)
+            away = np.array([step_x, step_y])
+            x, y = plan.layout.centre((i, j)) + away * (kerb_m + SIDEWALK_M + rng.uniform(1.5, 4.0))
+            block = objects.apartment_block(rng, 2 * half_m - 1.0, rng.uniform(9.0, 12.0), (3, 7))
+            if plan.near(np.array([[x, y]]), BUILT_M)[0]:
+                yield block.moved(x, y, TERRAIN_Z_M, float(np.arctan2(-step_y, -step_x)))
 
 
 def _green(rng: np.random.Generator, plan: Plan) -> Iterator[Mesh]:

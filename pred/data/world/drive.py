@@ -57,6 +57,8 @@ SEEN_M = 150.0
 
 _GRID = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 _MEMORY_US = 1_000_000
+_IN_SIGHT, _FEWEST_BEAMS = 0.2, 4.0
+_BEAM_SR = np.deg2rad((sensors.HIGHEST_RING_DEG - sensors.LOWEST_RING_DEG) / (NUM_RINGS - 1)) * 2 * np.pi / NUM_COLUMNS
 _EPOCH_US = 1_600_000_000_000_000
 _SCENE_STRIDE_US = 600_000_000
 _LEAD_US, _TAIL_US = 2_000_000, 200_000
@@ -171,7 +173,8 @@ class Drive:
         """Actors that annotators would mark: within `ANNOTATED_M` of the ego car, and in sight of the LiDAR's place
         now or one second earlier or later.
 
-        Moving actors hide nothing here, and in sight is what shows any part, however few points there are.
+        In sight is what shows a fifth, and as much as four beams of the LiDAR should meet; moving actors hide nothing
+        here, and how many points there are in the end is not asked.
         """
         ego = self.T_world_from_ego(time_us)[:2, 3]
         near = [actor for actor in self.actors if np.linalg.norm(actor.pose(time_us)[:2, 3] - ego) < ANNOTATED_M]
@@ -182,7 +185,8 @@ class Drive:
         return [actor for actor, visible in zip(near, seen, strict=True) if visible]
 
     def _in_sight(self, actors: list[Actor], time_us: int) -> NDArray[np.bool_]:
-        """[len(actors)] whether a ray from the LiDAR to any of 27 places in the box meets nothing still before."""
+        """[len(actors)] whether enough of the box shows behind what stands still: a share of 27 places in it, and
+        about four beams' worth."""
         if not actors:
             return np.zeros(0, dtype=np.bool_)
         origin = (self.T_world_from_ego(time_us) @ sensors.T_EGO_FROM_LIDAR)[:3, 3]
@@ -193,7 +197,11 @@ class Drive:
         distance_m = np.linalg.norm(sight, axis=1, keepdims=True)
         hits = self._still.cast(origin.astype(np.float32), (sight / distance_m).astype(np.float32))
         own = hits.instance == np.repeat([actor.instance for actor in actors], len(_GRID))
-        return np.asarray(((hits.t_m > distance_m[:, 0]) | own).reshape(len(actors), -1).any(axis=1))
+        clear = ((hits.t_m > distance_m[:, 0]) | own).reshape(len(actors), -1).mean(axis=1)
+        # Width times height over the solid angle between neighbouring beams.
+        area_m2 = np.sqrt(sizes[:, 0] * sizes[:, 1]) * sizes[:, 2]
+        beams = clear * area_m2 / (np.linalg.norm(poses[:, :3, 3] - origin, axis=1) ** 2 * _BEAM_SR)
+        return np.asarray((clear > _IN_SIGHT) & (beams > _FEWEST_BEAMS))
 
     def scan(self, time_us: int) -> Sweep:
         """The LiDAR revolution that ends at ``time_us``."""
@@ -261,7 +269,7 @@ class Drive:
         half_rad = float(np.arccos((directions @ optical_axis).min()))
         sector = Sector(float(np.arctan2(optical_axis[1], optical_axis[0])), half_rad, _SHADOW_M)
         (placements,) = self._mover_placements(np.array([time_us]))
-        moving = moving_layer(self._movers, placements, origin[:2], SEEN_M, sector)
+        moving = moving_layer(self._movers, placements, origin[:2].astype(np.float64), SEEN_M, sector)
         if moving is not None:
             cover(hits, moving, origin, directions, slice(None))
 

@@ -24,14 +24,15 @@ class Section:
     """A lane of a stretch, or a way across the junction at ``node``.
 
     Attributes:
-        key: identity; sections of different routes with one key are the same piece of road.
+        key: identity; sections of different routes with one key are the same piece of road. ("lane", from node, to
+            node, lane, 0) or ("turn", from node, junction, to node, lane).
         points: [n, 2] centre line.
         radius_m: of the bend; infinite where it runs straight on.
         node: junction that it crosses; None for a lane.
         approach: where traffic on it comes from.
     """
 
-    key: tuple[object, ...]
+    key: tuple[str, Node, Node, Node | int, int]
     points: NDArray[np.float64]
     radius_m: float
     node: Node | None
@@ -74,7 +75,7 @@ def lane_section(stretch: Stretch, lane: int) -> Section:
     """Lane ``lane`` of a stretch; 0 is the one beside the centre line."""
     right_m = (lane + 0.5) * LANE_M
     points = stretch.place(lane_range(stretch), [right_m, right_m])
-    return Section(("lane", stretch.a, stretch.b, lane), points, np.inf, None, stretch.a)
+    return Section(("lane", stretch.a, stretch.b, lane, 0), points, np.inf, None, stretch.a)
 
 
 def crossing_section(before: Stretch, lane: int, after: Stretch) -> tuple[Section, int] | None:
@@ -98,8 +99,8 @@ def crossing_section(before: Stretch, lane: int, after: Stretch) -> tuple[Sectio
     if abs(turn) < 0.5:
         return Section(key, np.array([start, end]), np.inf, before.b, before.a), target
     corner = start + before.ahead * ((end - start) @ before.ahead)
-    room_m = min(np.linalg.norm(corner - start), np.linalg.norm(end - corner))
-    radius_m = float(min(room_m, RIGHT_RADIUS_M if turn < 0 else LEFT_RADIUS_M))
+    room_m = min(float(np.linalg.norm(corner - start)), float(np.linalg.norm(end - corner)))
+    radius_m = min(room_m, RIGHT_RADIUS_M if turn < 0 else LEFT_RADIUS_M)
     angle = np.linspace(0.0, np.pi / 2, 33)
     middle = corner - radius_m * before.ahead + radius_m * after.ahead
     arc = middle + radius_m * (np.sin(angle)[:, None] * before.ahead - np.cos(angle)[:, None] * after.ahead)

@@ -42,7 +42,7 @@ class Layer:
     def __init__(self, ground: Mesh | None, actors: Sequence[tuple[Actor, NDArray[np.float64]]]) -> None:
         """``ground`` belongs to nobody; actors come with their T_world_from_box."""
         meshes = [] if ground is None else [ground]
-        meshes += [actor.mesh.turned(pose[:3, :3], pose[:3, 3]) for actor, pose in actors]
+        meshes += [actor.mesh.turned(pose[:3, :3], pose[:3, 3].tolist()) for actor, pose in actors]
         owners = [] if ground is None else [0]
         owners += [actor.instance for actor, _ in actors]
         self.scene = Scene(merge(meshes))
@@ -96,7 +96,7 @@ def moving_layer(
         None,
         [
             (actors[k], rigid(x, y, z + actors[k].lift_m, yaw_rad))
-            for k, (x, y, z, yaw_rad) in zip(found, placements[found], strict=True)
+            for k, (x, y, z, yaw_rad) in zip(found.tolist(), placements[found], strict=True)
         ],
     )
 

@@ -287,7 +287,7 @@ def traffic_sign(rng: np.random.Generator) -> Mesh:
 def apartment_block(
     rng: np.random.Generator, width_m: float, depth_m: float, storeys_range: tuple[int, int] = (3, 7)
 ) -> Mesh:
-    """Flat-roofed building with storeys drawn from a range (3 to 6); its front is at x = 0, facing +x, and its body behind."""
+    """Flat-roofed building, by default of 3 to 6 storeys; its front is at x = 0, facing +x, and its body behind."""
     storeys, storey_m = int(rng.integers(*storeys_range)), rng.uniform(2.9, 3.3)
     height = storeys * storey_m + 0.8
     paint = _vary(rng, _pick(rng, _FACADES))

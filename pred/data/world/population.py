@@ -15,8 +15,18 @@ from pred.data.world.actors import Actor, make_actor
 from pred.data.world.lanes import Route, draw_route, lane_section
 from pred.data.world.meshes import Mesh
 from pred.data.world.motion import Path, Profile, Stand, Travel
-from pred.data.world.town import KERB_Z_M, LANE_M, PARKING_M, SIDEWALK_M, TERRAIN_Z_M, CarPark, Layout, Stretch
-from pred.data.world.town import lane_range, zebra
+from pred.data.world.town import (
+    KERB_Z_M,
+    LANE_M,
+    PARKING_M,
+    SIDEWALK_M,
+    TERRAIN_Z_M,
+    CarPark,
+    Layout,
+    Stretch,
+    lane_range,
+    zebra,
+)
 from pred.data.world.traffic import Crossings, Driver, simulate
 
 EGO_SIZE_M = (4.1, 1.75)
@@ -47,7 +57,14 @@ _BUILDERS: dict[str, tuple[str, Builder]] = {
     "cone": ("movable_object.trafficcone", vehicles.traffic_cone),
     "barrier": ("movable_object.barrier", vehicles.barrier),
 }
-_TRAFFIC = (("car", 0.68), ("truck", 0.08), ("road train", 0.04), ("bus", 0.05), ("motorcyclist", 0.07), ("cyclist", 0.08))
+_TRAFFIC = (
+    ("car", 0.68),
+    ("truck", 0.08),
+    ("road train", 0.04),
+    ("bus", 0.05),
+    ("motorcyclist", 0.07),
+    ("cyclist", 0.08),
+)
 _PARKED = (("car", 0.84), ("truck", 0.05), ("trailer", 0.02), ("motorcycle", 0.05), ("bicycle", 0.04))
 
 Unit = list[Actor]
@@ -98,9 +115,7 @@ def draw_plan(rng: np.random.Generator, layout: Layout, duration_s: float) -> Pl
 
     middle = 0.5 * (first.kerb_a_m + first.kerb_b_m)
     plan = Plan(layout, route, front_m, first, (middle - SITE_M / 2, middle + SITE_M / 2), (), near)
-    others = [
-        stretch for stretch in layout.stretches() if stretch.a != first.a or stretch.b != first.b
-    ]
+    others = [stretch for stretch in layout.stretches() if stretch.a != first.a or stretch.b != first.b]
     others = [stretch for stretch in others if plan.has_frontage(stretch, 40.0)]
     chosen = rng.permutation(len(others))[:2]
     return Plan(layout, route, front_m, first, plan.site, tuple(_car_park(others[int(k)]) for k in chosen), near)
@@ -250,9 +265,7 @@ def _pavement_life(
     return standing, walking
 
 
-def _walker(
-    rng: np.random.Generator, kind: str, path: Path, start_us: int, begin_s: float, speed_mps: float
-) -> Actor:
+def _walker(rng: np.random.Generator, kind: str, path: Path, start_us: int, begin_s: float, speed_mps: float) -> Actor:
     """Somebody who sets out at ``begin_s`` and stops at the end of the path."""
     category, build = _BUILDERS[kind]
     step_m = 0.4

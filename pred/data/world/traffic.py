@@ -12,6 +12,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pred.data.world.lanes import Route
 from pred.data.world.motion import Profile
@@ -85,7 +86,7 @@ class _State:
         return max(min(value, ACCELERATION_MPS2), -HARDEST_MPS2, -self.speed / STEP_S)
 
 
-_Occupants = dict[tuple[object, ...], list[tuple[float, float, "_State"]]]
+_Occupants = dict[tuple[str, Node, Node, Node | int, int], list[tuple[float, float, "_State"]]]
 
 
 def simulate(
@@ -94,7 +95,7 @@ def simulate(
     """Motion of all drivers from ``start_us`` on."""
     states = [_State(driver) for driver in drivers]
     steps = int(np.ceil(duration_s / STEP_S)) + 1
-    record = np.zeros((len(states), 3, steps))
+    record: NDArray[np.float64] = np.zeros((len(states), 3, steps))
     for step in range(steps):
         occupants = _occupants(states)
         _release(states)
@@ -106,7 +107,7 @@ def simulate(
             record[index, :, step] = state.front, state.speed, acceleration
         for state, acceleration in zip(states, accelerations, strict=True):
             state.advance(acceleration)
-    knots_s = STEP_S * np.arange(steps)
+    knots_s = STEP_S * np.arange(steps, dtype=np.float64)
     return [Profile(start_us, knots_s, *record[index]) for index in range(len(states))]
 
 
@@ -152,9 +153,7 @@ def _release(states: list[_State]) -> None:
             state.held = None
 
 
-def _grant(
-    states: list[_State], occupants: _Occupants, layout: Layout, crossings: Crossings, time_s: float
-) -> None:
+def _grant(states: list[_State], occupants: _Occupants, layout: Layout, crossings: Crossings, time_s: float) -> None:
     """Let vehicles into junctions, those first that have asked first."""
     asking = []
     preferred: dict[Node, Node] = {}
@@ -199,9 +198,11 @@ def _grant(
         if any(
             begin < time_s + until_s and time_s + from_s < end
             for zebra, from_s, until_s in zebras
-            for begin, end in crossings.get(zebra, ())  # type: ignore[call-overload]
+            for begin, end in crossings.get(zebra, ())
         ):
             continue
-        if any(rear < state.driver.length_m + 3.0 and other.speed < 2.5 for rear, _, other in occupants.get(leaving, ())):
+        if any(
+            rear < state.driver.length_m + 3.0 and other.speed < 2.5 for rear, _, other in occupants.get(leaving, ())
+        ):
             continue
         state.granted, state.held, state.asked_s = state.section + 1, node, None

@@ -46,7 +46,13 @@ def truck(rng: np.random.Generator) -> Mesh:
         parts.append(boxes([-front, -0.02, 1.0], [-front + 0.02, 0.02, height - 0.1], frame))
     else:
         parts.append(
-            loft((-front + 0.35, load_front, -side + 0.15, side - 0.15), (-front, load_front, -side, side), 0.9, 2.2, body)
+            loft(
+                (-front + 0.35, load_front, -side + 0.15, side - 0.15),
+                (-front, load_front, -side, side),
+                0.9,
+                2.2,
+                body,
+            )
         )
         heap = material("truck", (0.42, 0.34, 0.26), 0.2)
         middle, half = (load_front - front) / 2, (load_front + front) / 2
@@ -69,7 +75,13 @@ def _cab(front: float, side: float, paint: Material) -> list[Mesh]:
             2.25,
             glass,
         ),
-        loft((rear, rear + 0.36, -side + 0.02, side - 0.02), (rear, rear + 0.36, -side + 0.1, side - 0.1), 1.45, 2.25, paint),
+        loft(
+            (rear, rear + 0.36, -side + 0.02, side - 0.02),
+            (rear, rear + 0.36, -side + 0.1, side - 0.1),
+            1.45,
+            2.25,
+            paint,
+        ),
         loft(
             (rear, front - 0.28, -side + 0.1, side - 0.1),
             (rear + 0.1, front - 0.5, -side + 0.2, side - 0.2),
@@ -119,7 +131,13 @@ def bus(rng: np.random.Generator) -> Mesh:
     return merge(
         [
             boxes([-front, -side, 0.35], [front, side, 1.15], paint),
-            loft((-front, front, -side, side), (-front, front - 0.12, -side + 0.04, side - 0.04), 1.15, height - 0.2, light),
+            loft(
+                (-front, front, -side, side),
+                (-front, front - 0.12, -side + 0.04, side - 0.04),
+                1.15,
+                height - 0.2,
+                light,
+            ),
             loft(
                 (-front, front - 0.12, -side + 0.04, side - 0.04),
                 (-front + 0.15, front - 0.3, -side + 0.2, side - 0.2),
@@ -199,7 +217,9 @@ def motorcycle(rng: np.random.Generator, ridden: bool) -> Mesh:
         boxes([-0.3, -0.16, 0.28], [0.35, 0.16, 0.62], chrome),
         loft((-0.1, 0.5, -0.16, 0.16), (0.0, 0.45, -0.1, 0.1), 0.62, 0.98, paint),
         loft((-1.0, 0.0, -0.12, 0.12), (-1.02, 0.0, -0.15, 0.15), 0.68, 0.84, dark),
-        cylinders([[0.74, y, 0.32] for y in (-0.1, 0.1)], [[0.46, y, 1.0] for y in (-0.1, 0.1)], 0.035, chrome, sides=6),
+        cylinders(
+            [[0.74, y, 0.32] for y in (-0.1, 0.1)], [[0.46, y, 1.0] for y in (-0.1, 0.1)], 0.035, chrome, sides=6
+        ),
         cylinders([0.42, -0.38, 1.06], [0.42, 0.38, 1.06], 0.025, dark, sides=6),
         blobs([0.58, 0, 0.92], [0.12, 0.12, 0.12], material("motorcycle", (0.95, 0.95, 0.88), 0.5)),
         boxes([-1.06, -0.08, 0.6], [-1.0, 0.08, 0.7], material("motorcycle", (0.75, 0.05, 0.05), 0.6)),
