@@ -94,7 +94,8 @@ def without_overlaps(
 ) -> tuple[Actor, ...]:
     """Actors that never overlap the ego car or each other, numbered from 1.
 
-    A unit (a lorry and its trailer) stays or goes as a whole. Of two that meet the one that is named later goes.
+    A unit (a lorry and its trailer, which must not overlap either) stays or goes as a whole. Of two that meet the one
+    that is named later goes.
 
     Args:
         units: actors; those that stand before those that move.
@@ -107,18 +108,18 @@ def without_overlaps(
     halves = [0.5 * np.array(ego_size_m) + 0.5 * margin_m]
     kept: list[Actor] = []
     for unit in units:
-        unit_tracks, unit_halves = [], []
-        for actor in unit:
-            unit_tracks.append(actor.motion.placements(times_us[:1] if actor.is_static else times_us))
-            unit_halves.append(0.5 * np.array(actor.size_lwh_m[:2]) + (0.0 if actor.is_static else margin_m))
+        bare = [0.5 * np.array(actor.size_lwh_m[:2]) for actor in unit]
+        grown = [half + (0.0 if actor.is_static else margin_m) for actor, half in zip(unit, bare, strict=True)]
+        own = [actor.motion.placements(times_us[:1] if actor.is_static else times_us) for actor in unit]
+        folds = any(_meet(own[i], bare[i], own[j], bare[j]) for i in range(len(unit)) for j in range(i))
         clear = all(
-            not _meet(track, half, other_track, other_half)
-            for track, half in zip(unit_tracks, unit_halves, strict=True)
-            for other_track, other_half in zip(tracks, halves, strict=True)
+            not _meet(track, half, other, other_half)
+            for track, half in zip(own, grown, strict=True)
+            for other, other_half in zip(tracks, halves, strict=True)
         )
-        if clear:
-            tracks += unit_tracks
-            halves += unit_halves
+        if clear and not folds:
+            tracks += own
+            halves += grown
             kept += unit
     return tuple(replace(actor, instance=number) for number, actor in enumerate(kept, start=1))
 

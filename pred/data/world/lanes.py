@@ -24,15 +24,16 @@ class Section:
     """A lane of a stretch, or a way across the junction at ``node``.
 
     Attributes:
-        key: identity; sections of different routes with one key are the same piece of road. ("lane", from node, to
-            node, lane, 0) or ("turn", from node, junction, to node, lane).
+        key: identity; sections of different routes with one key are the same piece of road. ("lane" or "turn",
+            node it comes from, node it leads to or crosses, node after that, lane); the last node of a lane is its
+            second.
         points: [n, 2] centre line.
         radius_m: of the bend; infinite where it runs straight on.
         node: junction that it crosses; None for a lane.
         approach: where traffic on it comes from.
     """
 
-    key: tuple[str, Node, Node, Node | int, int]
+    key: tuple[str, Node, Node, Node, int]
     points: NDArray[np.float64]
     radius_m: float
     node: Node | None
@@ -64,7 +65,9 @@ class Route:
         limit = np.full(int(self.starts_m[-1]) + 2, 30.0)
         for section, start_m, end_m in zip(self.sections, self.starts_m, self.starts_m[1:], strict=False):
             if np.isfinite(section.radius_m):
-                bend = slice(int(start_m), int(end_m) + 1)
+                # The first and the last piece are straight; the axles follow the front by some metres.
+                before_m, after_m = (float(np.linalg.norm(section.points[k] - section.points[k + 1])) for k in (0, -2))
+                bend = slice(int(start_m + before_m), int(end_m - after_m) + 4)
                 limit[bend] = np.minimum(limit[bend], np.sqrt(LATERAL_MPS2 * section.radius_m))
         for metre in range(len(limit) - 2, -1, -1):
             limit[metre] = min(limit[metre], np.sqrt(limit[metre + 1] ** 2 + 2 * BRAKING_MPS2))
@@ -75,7 +78,7 @@ def lane_section(stretch: Stretch, lane: int) -> Section:
     """Lane ``lane`` of a stretch; 0 is the one beside the centre line."""
     right_m = (lane + 0.5) * LANE_M
     points = stretch.place(lane_range(stretch), [right_m, right_m])
-    return Section(("lane", stretch.a, stretch.b, lane, 0), points, np.inf, None, stretch.a)
+    return Section(("lane", stretch.a, stretch.b, stretch.b, lane), points, np.inf, None, stretch.a)
 
 
 def crossing_section(before: Stretch, lane: int, after: Stretch) -> tuple[Section, int] | None:

@@ -37,7 +37,7 @@ PEOPLED_M = 100.0
 SITE_M = 15.0
 CORNER_LOT_M = 16.0
 """Depth of the lots; those of the crossing road take that much at either end of a stretch."""
-DRAWBAR_GAP_M = 0.3
+DRAWBAR_GAP_M = 0.9
 
 Builder = Callable[[np.random.Generator], Mesh]
 _BUILDERS: dict[str, tuple[str, Builder]] = {
@@ -306,8 +306,9 @@ def _crossing_people(
         path = Path(np.column_stack([stretch.place(np.full(6, along), across), heights]))
         speed_mps, set_out_s = rng.uniform(1.3, 1.9), begin_s + rng.uniform(0.0, 1.0)
         yield [_walker(rng, "adult", path, start_us, set_out_s, speed_mps)]
-        on_road = (set_out_s, set_out_s + path.length_m / speed_mps)
-        crossings.setdefault((stretch.a, stretch.b), []).append(on_road)
+        middle_s, end_s = (set_out_s + share * path.length_m / speed_mps for share in (0.5, 1.0))
+        for is_right, span_s in ((side > 0, (set_out_s, middle_s + 0.5)), (side < 0, (middle_s - 0.5, end_s))):
+            crossings.setdefault((stretch.a, stretch.b, is_right), []).append(span_s)
 
 
 def _draw_traffic(

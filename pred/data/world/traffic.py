@@ -27,8 +27,9 @@ NEAR_CLEAR_S, FAR_CLEAR_S = 4.0, (1.5, 8.0)
 PATIENCE_S = 4.0
 """Vehicles let the cars behind one another pass for that long before it is their turn."""
 
-Crossings = dict[tuple[Node, Node], list[tuple[float, float]]]
-"""(node that the stretch comes from, node at the crossing) -> seconds during which somebody is on the road there."""
+Crossings = dict[tuple[Node, Node, bool], list[tuple[float, float]]]
+"""(node that the stretch comes from, node at the crossing, whether on the half of the road that leads to that node)
+-> seconds during which somebody walks there."""
 
 
 @dataclass
@@ -41,7 +42,7 @@ class Driver:
         front_m: of its front on the route, at least ``length_m``.
         desired_mps: speed on a free road.
         hold_s: how long it stands before its first junction at least.
-        has_priority: once it has stood, other approaches of the junction ahead of it wait.
+        has_priority: other approaches of the junction ahead of it wait, at the first from when it nearly stands on.
     """
 
     route: Route
@@ -86,7 +87,7 @@ class _State:
         return max(min(value, ACCELERATION_MPS2), -HARDEST_MPS2, -self.speed / STEP_S)
 
 
-_Occupants = dict[tuple[str, Node, Node, Node | int, int], list[tuple[float, float, "_State"]]]
+_Occupants = dict[tuple[str, Node, Node, Node, int], list[tuple[float, float, "_State"]]]
 
 
 def simulate(
@@ -162,17 +163,19 @@ def _grant(states: list[_State], occupants: _Occupants, layout: Layout, crossing
         if following >= len(state.sections) or following <= state.granted or not _is_guarded(state, following, layout):
             continue
         distance = state.starts[following] - state.front
+        node = state.sections[following].node
+        assert node is not None
+        if state.driver.has_priority and distance < LOOK_AHEAD_M and (state.hold_s <= 0 or state.speed < 3.0):
+            preferred[node] = state.sections[following].approach
         if state.hold_s > 0:
             # The first stop of somebody who has to stop: time runs once it stands.
             if state.speed < 0.3:
                 state.hold_s -= STEP_S
             continue
-        if state.driver.has_priority and distance < LOOK_AHEAD_M:
-            preferred[state.sections[following].node] = state.sections[following].approach  # type: ignore[index]
         # Nobody asks from behind somebody who has not been let in yet.
         offset = state.front - state.starts[state.section]
         on_lane = occupants.get(state.sections[state.section].key, ())
-        is_first = all(front <= offset or other.held == state.sections[following].node for _, front, other in on_lane)
+        is_first = all(front <= offset or other.held == node for _, front, other in on_lane)
         if is_first and distance < state.speed**2 / (2 * BRAKING_MPS2) + 12.0:
             state.asked_s = time_s if state.asked_s is None else state.asked_s
             asking.append((state.asked_s, order, state))
@@ -194,7 +197,10 @@ def _grant(states: list[_State], occupants: _Occupants, layout: Layout, crossing
             continue
         leaving = state.sections[state.section + 2].key
         # The crossing on this side is passed at once, the one on the other side some seconds later.
-        zebras = (((approach, node), 0.0, NEAR_CLEAR_S), ((leaving[2], node), FAR_CLEAR_S[0], FAR_CLEAR_S[1]))
+        zebras = (
+            ((approach, node, True), 0.0, NEAR_CLEAR_S),
+            ((section.key[3], node, False), FAR_CLEAR_S[0], FAR_CLEAR_S[1]),
+        )
         if any(
             begin < time_s + until_s and time_s + from_s < end
             for zebra, from_s, until_s in zebras
