@@ -7,16 +7,17 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from pred.data.frame import invert_rigid, transform_points
-from pred.data.world import CATEGORIES, Actor, Drive, Sweep, sensors
+from pred.data.world import CATEGORIES, Actor, Drive, Sweep, sensors, vehicles
 from pred.data.world.actors import MARGIN_M, make_actor, without_overlaps
 from pred.data.world.drive import EGO, NOISE, ego_range_m
-from pred.data.world.meshes import Material, boxes, prism
+from pred.data.world.meshes import Material, Mesh, boxes, prism
 from pred.data.world.motion import Path, Profile, Stand, Travel, overlap
 from pred.data.world.objects import CLASS_IDS
 from pred.data.world.population import EGO_SIZE_M
@@ -131,6 +132,37 @@ def test_what_overlaps_goes_with_its_unit() -> None:
     ego = Travel(Path([[0, 0, 0], [50, 0, 0]]), still, 0.0, 4.0)  # its middle at x = 8
     kept = without_overlaps([[at(8, 0)], [at(20, 0)], [at(21, 0), at(40, 0)], [at(30, 0)]], ego, (4, 2), np.array([0]))
     assert [(actor.instance, actor.pose(0)[0, 3]) for actor in kept] == [(1, 20), (2, 30)]
+
+
+BUILDERS: list[tuple[Callable[[np.random.Generator], Mesh], list[float], set[str]]] = [
+    (vehicles.truck, [7.3, 2.4, 3.0], {"truck"}),
+    (vehicles.trailer, [6.8, 2.4, 3.0], {"truck"}),
+    (vehicles.bus, [10.5, 2.55, 3.1], {"bus"}),
+    (vehicles.excavator, [5.8, 2.4, 3.4], {"truck"}),
+    (vehicles.wheel_loader, [6.0, 2.5, 3.1], {"truck"}),
+    (lambda rng: vehicles.motorcycle(rng, ridden=False), [2.1, 0.76, 1.09], {"motorcycle"}),
+    (lambda rng: vehicles.motorcycle(rng, ridden=True), [2.1, 0.76, 1.75], {"motorcycle", "rider"}),
+    (lambda rng: vehicles.bicycle(rng, ridden=False), [1.76, 0.58, 1.04], {"bicycle"}),
+    (lambda rng: vehicles.bicycle(rng, ridden=True), [1.76, 0.62, 1.83], {"bicycle", "rider"}),
+    (vehicles.construction_worker, [0.65, 0.67, 1.8], {"person"}),
+    (vehicles.child, [0.45, 0.48, 1.23], {"person"}),
+    (vehicles.barrier, [0.6, 1.98, 1.0], {"fence"}),
+]
+
+
+@pytest.mark.parametrize(("build", "size", "classes"), BUILDERS)
+def test_objects_have_the_size_of_their_kind(
+    build: Callable[[np.random.Generator], Mesh], size: list[float], classes: set[str]
+) -> None:
+    for seed in range(4):
+        mesh = build(np.random.default_rng(seed))
+        low, high = mesh.bounds()
+        assert abs(low[2]) < 0.04
+        np.testing.assert_allclose(high - low, size, rtol=0.4 if classes == {"person"} else 0.26)
+        assert set(mesh.class_ids) == {CLASS_IDS[name] for name in classes}
+        assert mesh.faces.max() < len(mesh.vertices) and ((mesh.colours >= 0) & (mesh.colours <= 1.5)).all()
+    cone = vehicles.traffic_cone(np.random.default_rng(0))
+    assert set(cone.class_ids) == {NO_CLASS}
 
 
 # Map

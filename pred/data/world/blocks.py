@@ -67,7 +67,7 @@ def _ground(layout: Layout) -> Iterator[Mesh]:
 
 
 def _paint(layout: Layout, stretch: Stretch) -> Iterator[Mesh]:
-    """Lines, arrows' place left bare, stop lines, zebra stripes and the marks of parking places."""
+    """Centre and lane lines, stop lines, zebra stripes and the marks of parking places."""
     low, high = lane_range(stretch)
     edge = stretch.lanes * LANE_M
     if stretch.a < stretch.b:

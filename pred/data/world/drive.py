@@ -71,8 +71,10 @@ _BACKGROUND = {
     "road": "flat.driveable_surface", "sidewalk": "flat.sidewalk", "terrain": "flat.terrain",
     "vegetation": "static.vegetation",
 }  # fmt: skip
-_BASE_LOSS, _FAR_LOSS = 0.01, 0.035
+_BASE_LOSS, _FAR_LOSS = 0.01, 0.02
 """Lost returns: of all, and of a surface that returns one tenth of the light from `MAX_RANGE_M`."""
+_FULL_INTENSITY = 200.0
+"""Of a surface that returns all light."""
 
 
 class Sweep(NamedTuple):
@@ -237,7 +239,7 @@ class Drive:
         range_m = np.where(on_car, on_car_m, hits.t_m).astype(np.float64)
         lost = _BASE_LOSS + _FAR_LOSS * (range_m / MAX_RANGE_M) ** 2 / np.maximum(returned, 1e-3) * 10
         no_return = ~on_car & ((chance < lost) | (range_m >= MAX_RANGE_M) | (range_m <= MIN_RANGE_M))
-        intensity = np.where(on_car, 60 * glint**3, np.rint(255 * returned))
+        intensity = np.where(on_car, 60 * glint**3, _FULL_INTENSITY * returned)
         world = origins + directions * np.where(no_return, 0.0, range_m + noise_m)[:, None]
         T_lidar_from_world = invert_rigid(self.T_world_from_ego(time_us) @ sensors.T_EGO_FROM_LIDAR)
         points = np.empty((len(beams), 5), dtype=np.float32)
