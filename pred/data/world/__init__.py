@@ -1,11 +1,16 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""The embedded default data: procedural streets seen by a LiDAR and six cameras, with exact semantics.
+"""Procedural worlds seen by a LiDAR and six cameras, with exact semantics.
 
-`meshes` are primitives, `objects` what they are assembled to, `street` the layout, `scene` the ray caster, `sensors`
-the LiDAR and the cameras, `frames` the `FrameSource` on top.
+`Drive` is a drive through a town with traffic; `StreetFrames`, the embedded default data, single moments of one street.
+`meshes` are primitives; `objects` and `vehicles` what they are assembled to. Of a town, `town` is the plan, `lanes` and
+`traffic` how vehicles move, `population` who is there, `actors` what has an annotation, `blocks` what has none. `scene`
+and `moment` cast rays, `sensors` are the LiDAR and the cameras. `street` and `frames` make the streets.
 """
 
+from pred.data.world.actors import Actor
+from pred.data.world.drive import CATEGORIES, Drive, Sweep, View
 from pred.data.world.frames import StreetConfig, StreetFrames
+from pred.data.world.town import TownMap
 
-__all__ = ["StreetConfig", "StreetFrames"]
+__all__ = ["CATEGORIES", "Actor", "Drive", "StreetConfig", "StreetFrames", "Sweep", "TownMap", "View"]

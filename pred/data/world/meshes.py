@@ -61,6 +61,10 @@ class Mesh:
         vertices = self.vertices @ np.asarray(rotation, dtype=np.float64).T + np.asarray(shift)
         return Mesh(vertices, self.faces, self.class_ids, self.colours, self.reflectances)
 
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lowest and highest corner, [3] each."""
+        return self.vertices.min(axis=0), self.vertices.max(axis=0)
+
 
 def merge(meshes: Sequence[Mesh]) -> Mesh:
     """All triangles in one mesh, in the order given."""
@@ -107,6 +111,19 @@ def loft(
         axis=1,
     )
     return _instances(corners[None], _BOX_FACES, material)
+
+
+def prism(outline: ArrayLike, z_low: float, z_high: float, material: Material) -> Mesh:
+    """Upright solid over a convex ``outline`` [n, 2], given counter-clockwise."""
+    outline = np.asarray(outline, dtype=np.float64)
+    count = len(outline)
+    corners = np.concatenate([np.column_stack([outline, np.full(count, z)]) for z in (z_low, z_high)])
+    near, fan = np.arange(count), np.arange(1, count - 1)
+    after = (near + 1) % count
+    sides = [(near, after, after + count), (near, after + count, near + count)]
+    ends = [(fan * 0 + count, fan + count, fan + 1 + count), (fan * 0, fan + 1, fan)]
+    faces = np.concatenate([np.stack(part, axis=1) for part in (*sides, *ends)]).astype(np.int32)
+    return _instances(corners[None], faces, material)
 
 
 def cylinders(

@@ -40,6 +40,10 @@ def material(class_name: str, colour: Colour, reflectance: float) -> Material:
     return Material(CLASS_IDS[class_name], colour, reflectance)
 
 
+ASPHALT = material("road", (0.33, 0.33, 0.34), 0.1)
+PAINT = material("road", (0.88, 0.88, 0.85), 0.45)
+PAVING = material("sidewalk", (0.62, 0.60, 0.57), 0.2)
+GRASS = material("terrain", (0.45, 0.58, 0.28), 0.25)
 _STEEL = material("pole", (0.42, 0.44, 0.45), 0.25)
 
 
@@ -280,9 +284,11 @@ def traffic_sign(rng: np.random.Generator) -> Mesh:
     return merge([cylinders([0, 0, -0.1], [0, 0, 2.9], 0.05, _STEEL, sides=8), plate])
 
 
-def apartment_block(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
-    """Flat-roofed building of 3 to 6 storeys; its front is at x = 0, facing +x, and its body behind."""
-    storeys, storey_m = int(rng.integers(3, 7)), rng.uniform(2.9, 3.3)
+def apartment_block(
+    rng: np.random.Generator, width_m: float, depth_m: float, storeys_range: tuple[int, int] = (3, 7)
+) -> Mesh:
+    """Flat-roofed building, by default of 3 to 6 storeys; its front is at x = 0, facing +x, and its body behind."""
+    storeys, storey_m = int(rng.integers(*storeys_range)), rng.uniform(2.9, 3.3)
     height = storeys * storey_m + 0.8
     paint = _vary(rng, _pick(rng, _FACADES))
     facade = material("building", paint, rng.uniform(0.15, 0.35))
@@ -328,6 +334,17 @@ def house(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
     ]
     parts += _windows(width_m, depth_m, np.array([0.9, 3.4]))
     return merge(parts)
+
+
+def woods(rng: np.random.Generator, nearest_m: float, farthest_m: float, count: int) -> Mesh:
+    """Ring of tree tops around the origin, so that the horizon is not bare."""
+    leaves = material("vegetation", (0.22, 0.36, 0.20), 0.2)
+    turn = 2 * np.pi * (np.arange(count) + rng.uniform(0, 1, count)) / count
+    distance_m = rng.uniform(nearest_m, farthest_m, count)
+    height_m = rng.uniform(5.0, 11.0, count)
+    centres = np.stack([distance_m * np.cos(turn), distance_m * np.sin(turn), 0.6 * height_m], axis=1)
+    radii = np.stack([np.full(count, 10.0), np.full(count, 10.0), height_m], axis=1)
+    return blobs(centres, radii, leaves, rng, roughness=0.07)
 
 
 def _windows(width_m: float, depth_m: float, sills_m: NDArray[np.float64]) -> list[Mesh]:

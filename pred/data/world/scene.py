@@ -59,13 +59,23 @@ class Scene:
 
     def cast(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits:
         """First hits of rays from ``origins`` [N, 3] (or one [3]) along unit ``directions`` [N, 3]."""
+        t_m, face = self.first(origins, directions)
+        return self.hits(t_m, face, directions)
+
+    def first(
+        self, origins: NDArray[np.float32], directions: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Distance and triangle of first hits alone, as in `Hits`."""
         directions = np.ascontiguousarray(directions, dtype=np.float32)
         origins = np.broadcast_to(np.asarray(origins, dtype=np.float32), directions.shape)
         found = self._tracer.run(np.ascontiguousarray(origins), directions, output=1)
         face = found["primID"].astype(np.int64)
-        t_m = np.where(face >= 0, found["tfar"], np.float32(np.inf))
+        return np.where(face >= 0, found["tfar"], np.float32(np.inf)), face
+
+    def hits(self, t_m: NDArray[np.float32], face: NDArray[np.int64], directions: NDArray[np.float32]) -> Hits:
+        """What there is to know of first hits of rays along ``directions``."""
         normal = self._normals[face]
-        away = np.einsum("nc,nc->n", normal, directions) > 0
+        away = np.einsum("nc,nc->n", normal, directions.astype(np.float32, copy=False)) > 0
         normal[away] *= -1
         return Hits(t_m, face, self._class_ids[face], normal)
 

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A LiDAR and six cameras modelled on the nuScenes car, looking at a ray-cast scene.
 
-Nothing moves during a sweep, and all sensors measure at the same time. The ego car itself is not modelled: there are
-no returns from it, and no camera sees it.
+In `scan` nothing moves, all sensors measure at the same time, and there is no ego car; `pred.data.world.drive` has all
+of that.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -30,8 +31,8 @@ T_EGO_FROM_LIDAR = np.array([[0.0, 1.0, 0.0, 0.94], [-1.0, 0.0, 0.0, 0.0], [0.0,
 
 
 class Mount(NamedTuple):
-    """Place and optics of a camera: metres in the ego frame, yaw counter-clockwise from ahead, focal length in pixels
-    of a 1600-pixel wide image."""
+    """Place and optics of a camera: metres in the ego frame, yaw counter-clockwise from ahead, pitch upwards, focal
+    length and principal point (None: the middle) in pixels of an image of 1600 x 900."""
 
     name: str
     x_m: float
@@ -39,6 +40,8 @@ class Mount(NamedTuple):
     z_m: float
     yaw_deg: float
     focal_px: float
+    pitch_deg: float = 0.0
+    centre_px: tuple[float, float] | None = None
 
 
 MOUNTS = (
@@ -49,7 +52,17 @@ MOUNTS = (
     Mount("CAM_BACK_LEFT", 1.05, 0.50, 1.55, 110.0, 1266.0),
     Mount("CAM_FRONT_LEFT", 1.55, 0.50, 1.50, 55.0, 1266.0),
 )
-MOUNT_IMAGE_WIDTH = 1600
+MOUNT_IMAGE_WIDTH, MOUNT_IMAGE_HEIGHT = 1600, 900
+
+CALIBRATED_MOUNTS = (
+    Mount("CAM_FRONT", 1.70, 0.02, 1.51, 0.3, 1266.0, -0.3, (816.0, 492.0)),
+    Mount("CAM_FRONT_RIGHT", 1.55, -0.49, 1.50, -56.4, 1261.0, -0.8, (808.0, 495.0)),
+    Mount("CAM_BACK_RIGHT", 1.01, -0.48, 1.56, -110.8, 1260.0, -0.9, (807.0, 501.0)),
+    Mount("CAM_BACK", 0.03, 0.0, 1.58, 179.9, 809.0, 1.0, (829.0, 482.0)),
+    Mount("CAM_BACK_LEFT", 1.04, 0.48, 1.59, 108.6, 1257.0, -0.9, (792.0, 493.0)),
+    Mount("CAM_FRONT_LEFT", 1.52, 0.49, 1.51, 55.2, 1273.0, 0.1, (827.0, 480.0)),
+)
+"""The calibration of one nuScenes car, rounded; `MOUNTS` is its idealisation."""
 
 
 class Sweep(NamedTuple):
@@ -92,11 +105,20 @@ def scan(scene: Scene, T_world_from_lidar: NDArray[np.float64], rng: np.random.G
     (ray_index,) = np.nonzero(kept & (hits.t_m > MIN_RANGE_M) & (hits.t_m < MAX_RANGE_M))
     range_m = hits.t_m[ray_index] + noise_m[ray_index]
     cosine = -np.einsum("nc,nc->n", hits.normal[ray_index], directions_world[ray_index])
-    returned = scene.reflectances[hits.face[ray_index]] * (0.2 + 0.8 * cosine) * speckle[ray_index]
+    returned = returned_light(scene.reflectances[hits.face[ray_index]], cosine, speckle[ray_index])
     points = np.zeros((len(ray_index), 5), dtype=np.float32)
     points[:, :3] = directions[ray_index] * range_m[:, None]
     points[:, 3] = np.rint(255 * returned).clip(0, 255)
     return Sweep(points, ray_index, hits.class_id[ray_index])
+
+
+def returned_light(
+    reflectance: NDArray[np.float32],  # [N]
+    cosine: NDArray[np.float32],  # [N] of the angle between the ray and the surface's normal
+    speckle: NDArray[np.float64],  # [N] random factor
+) -> NDArray[np.float64]:
+    """[N] share of the light that comes back: by material and angle of incidence."""
+    return np.asarray(reflectance * (0.2 + 0.8 * cosine) * speckle)
 
 
 def mounted_camera(mount: Mount, width: int, height: int) -> Camera:
@@ -105,10 +127,18 @@ def mounted_camera(mount: Mount, width: int, height: int) -> Camera:
     c, s = np.cos(yaw), np.sin(yaw)
     T_ego_from_camera = np.eye(4)
     # Columns: the camera's x (right), y (down) and z (ahead) axes.
-    T_ego_from_camera[:3, :3] = [[s, 0.0, c], [-c, 0.0, s], [0.0, -1.0, 0.0]]
+    level = np.array([[s, 0.0, c], [-c, 0.0, s], [0.0, -1.0, 0.0]])
+    if mount.pitch_deg:
+        c, s = np.cos(np.deg2rad(mount.pitch_deg)), np.sin(np.deg2rad(mount.pitch_deg))
+        level = level @ [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]
+    T_ego_from_camera[:3, :3] = level
     T_ego_from_camera[:3, 3] = mount.x_m, mount.y_m, mount.z_m
     focal_px = mount.focal_px * width / MOUNT_IMAGE_WIDTH
-    intrinsics = np.array([[focal_px, 0.0, width / 2], [0.0, focal_px, height / 2], [0.0, 0.0, 1.0]])
+    centre_x, centre_y = width / 2, height / 2
+    if mount.centre_px is not None:
+        centre_x = mount.centre_px[0] * width / MOUNT_IMAGE_WIDTH
+        centre_y = mount.centre_px[1] * height / MOUNT_IMAGE_HEIGHT
+    intrinsics = np.array([[focal_px, 0.0, centre_x], [0.0, focal_px, centre_y], [0.0, 0.0, 1.0]])
     T_camera_from_lidar = invert_rigid(T_ego_from_camera) @ T_EGO_FROM_LIDAR
     return Camera(mount.name, intrinsics, T_camera_from_lidar, width, height)
 
@@ -141,22 +171,37 @@ def render_image(
     """Picture, uint8 [height, width, 3]: Lambert shading with cast shadows, haze and a sky gradient."""
     origin, directions = camera_rays(camera, T_world_from_lidar)
     hits = scene.cast(origin, directions)
+    (solid,) = np.nonzero(hits.face >= 0)
+    colours = scene.colours[hits.face[solid]]
+    pixels = shade(origin, directions, solid, hits.t_m[solid], hits.normal[solid], colours, sun, scene.occluded)
+    return pixels.reshape(camera.height, camera.width, 3)
+
+
+def shade(
+    origin: NDArray[np.float32],  # [3]
+    directions: NDArray[np.float32],  # [N, 3] unit
+    solid: NDArray[np.int64],  # [M] rays that meet something
+    t_m: NDArray[np.float32],  # [M]
+    normal: NDArray[np.float32],  # [M, 3]
+    colours: NDArray[np.float32],  # [M, 3]
+    sun: NDArray[np.float32],  # [3]
+    occluded: Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.bool_]],
+) -> NDArray[np.uint8]:
+    """Colours of N rays, uint8 [N, 3]: Lambert shading with cast shadows and haze; sky where a ray meets nothing."""
     up = directions[:, 2:].clip(0, 1)
     sky = _HORIZON + (_ZENITH - _HORIZON) * np.sqrt(up)
-    (solid,) = np.nonzero(hits.face >= 0)
-    normal, t_m = hits.normal[solid], hits.t_m[solid, None]
+    t_m = t_m[:, None]
     # A little off the surface, or it would shade itself.
     places = origin + directions[solid] * t_m + normal * np.float32(0.01)
     facing = (normal @ sun).clip(0, 1)
     lit = np.flatnonzero(facing)
     towards_sun = np.broadcast_to(sun, (len(lit), 3))
-    facing[lit[scene.occluded(places[lit], towards_sun)]] = 0
+    facing[lit[occluded(places[lit], towards_sun)]] = 0
     light = _AMBIENT * (1 + 0.25 * normal[:, 2:]) + _SUNLIGHT * facing[:, None]
     haze = 1 - np.exp(-t_m / _VISIBILITY_M)
     image = sky.copy()
-    image[solid] = scene.colours[hits.face[solid]] * light * (1 - haze) + _HORIZON * haze
-    pixels = np.rint(255 * image.clip(0, 1)).astype(np.uint8)
-    return pixels.reshape(camera.height, camera.width, 3)
+    image[solid] = colours * light * (1 - haze) + _HORIZON * haze
+    return np.rint(255 * image.clip(0, 1)).astype(np.uint8)
 
 
 _HORIZON = np.array([0.82, 0.88, 0.94], dtype=np.float32)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pred.data.world import objects
-from pred.data.world.meshes import Material, Mesh, blobs, boxes, merge, quads
+from pred.data.world.meshes import Mesh, boxes, merge, quads
 from pred.data.world.scene import Scene
 
 HALF_LENGTH_M = 115.0
@@ -28,11 +28,6 @@ DRIVE_M = 60.0
 """Stretch of the street along which the ego car is seen."""
 CLEARANCE_M = 8.0
 """No car in the ego lane comes nearer to the ego car."""
-
-_ASPHALT = objects.material("road", (0.33, 0.33, 0.34), 0.1)
-_PAINT = objects.material("road", (0.88, 0.88, 0.85), 0.45)
-_PAVING = objects.material("sidewalk", (0.62, 0.60, 0.57), 0.2)
-_GRASS = objects.material("terrain", (0.45, 0.58, 0.28), 0.25)
 
 
 @dataclass(frozen=True)
@@ -64,7 +59,7 @@ def build_street(rng: np.random.Generator, num_poses: int) -> Street:
         meshes += _parked_cars(rng, crossing_x, side)
     meshes += _crossing(rng, crossing_x, poses_x)
     meshes += _traffic(rng, crossing_x, poses_x)
-    meshes.append(_backdrop(rng))
+    meshes.append(objects.woods(rng, 140.0, 170.0, 50))
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(35, 60))
     sun = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     return Street(Scene(merge(meshes)), poses, np.array(sun, dtype=np.float32))
@@ -81,10 +76,10 @@ def _pose(x: float, y: float, yaw_rad: float) -> NDArray[np.float64]:
 def _ground(crossing_x: float) -> Iterator[Mesh]:
     """Road everywhere; on it four raised blocks of sidewalk, and on those the terrain. No two surfaces coincide."""
     far = 220.0
-    yield boxes([-far, -far, -1.0], [far, far, 0.0], _ASPHALT)
+    yield boxes([-far, -far, -1.0], [far, far, 0.0], objects.ASPHALT)
     for along in (-1, 1):
         for side in (-1, 1):
-            for inset, height, material in ((0.0, 0.13, _PAVING), (SIDEWALK_M, 0.16, _GRASS)):
+            for inset, height, material in ((0.0, 0.13, objects.PAVING), (SIDEWALK_M, 0.16, objects.GRASS)):
                 x_near = crossing_x + along * (SIDE_STREET_HALF_M + inset)
                 y_near = side * (KERB_Y_M + inset)
                 x, y = sorted((x_near, along * (far - 1))), sorted((y_near, side * (far - 1)))
@@ -105,7 +100,7 @@ def _painted(x: NDArray[np.float64], y: NDArray[np.float64], length_m: float, wi
     """Rectangles of road paint centred at (x, y), 5 mm above the asphalt."""
     half_x, half_y = np.array([-1, 1, 1, -1]) * length_m / 2, np.array([-1, -1, 1, 1]) * width_m / 2
     corner_x, corner_y = x[:, None] + half_x, y[:, None] + half_y
-    return quads(np.stack([corner_x, corner_y, np.full_like(corner_x, 0.005)], axis=2), _PAINT)
+    return quads(np.stack([corner_x, corner_y, np.full_like(corner_x, 0.005)], axis=2), objects.PAINT)
 
 
 def _clear_of_crossing(x: NDArray[np.float64], crossing_x: float, gap_m: float) -> NDArray[np.float64]:
@@ -203,15 +198,3 @@ def _traffic(rng: np.random.Generator, crossing_x: float, poses_x: NDArray[np.fl
             if free and rng.random() < 0.3:
                 y = lane * LANE_M / 2 + rng.normal(0, 0.12)
                 yield objects.car(rng).moved(x, y, 0.0, heading + rng.normal(0, 0.02))
-
-
-def _backdrop(rng: np.random.Generator) -> Mesh:
-    """Woods around the town, so that the horizon is not bare."""
-    woods = Material(objects.CLASS_IDS["vegetation"], (0.22, 0.36, 0.20), 0.2)
-    count = 50
-    turn = 2 * np.pi * (np.arange(count) + rng.uniform(0, 1, count)) / count
-    distance_m = rng.uniform(140.0, 170.0, count)
-    height_m = rng.uniform(5.0, 11.0, count)
-    centres = np.stack([distance_m * np.cos(turn), distance_m * np.sin(turn), 0.6 * height_m], axis=1)
-    radii = np.stack([np.full(count, 10.0), np.full(count, 10.0), height_m], axis=1)
-    return blobs(centres, radii, woods, rng, roughness=0.07)
