@@ -416,8 +416,8 @@ class Fuzzer:
 
 
 def _as_number(value: Any, argument: torch.Argument) -> Any:
-    """The number that torch reads from a tensor in a number's place; a fake tensor has none."""
-    return value.item() if isinstance(value, Tensor) and "Tensor" not in str(argument.type) else value
+    """The number, or list, that torch reads from a tensor in its place; a fake tensor has none."""
+    return value.tolist() if isinstance(value, Tensor) and "Tensor" not in str(argument.type) else value
 
 
 # --- child and parent ------------------------------------------------------------------------------

@@ -16,10 +16,12 @@ HALF = (torch.bfloat16, torch.float16)
 
 
 def check_tensors(op: str, **arguments: object) -> None:
-    """Each must be a tensor."""
+    """Each must be a dense tensor."""
     for name, value in arguments.items():
         if not isinstance(value, Tensor):
             raise TypeError(f"{op}: {name} must be a tensor, got {type(value).__name__}")
+        if value.layout != torch.strided:
+            raise TypeError(f"{op}: {name} must be dense, got a tensor of layout {value.layout}")
 
 
 def check_shape(op: str, name: str, tensor: Tensor, shape: Sequence[int | str], where: str = "") -> None:

@@ -229,6 +229,7 @@ def sharpness_argument(op: str, inv_s: Tensor | float, sdf: Tensor) -> Tensor:
         if not 0 <= inv_s < math.inf:
             raise ValueError(f"{op}: inv_s must be finite and not negative, got {inv_s}")
         return _scalar(float(inv_s), sdf)
+    check_tensors(op, inv_s=inv_s)
     if inv_s.numel() != 1:
         raise ValueError(f"{op}: inv_s must have one element, got shape {list(inv_s.shape)}")
     if not inv_s.is_floating_point():

@@ -174,12 +174,12 @@ def test_vmap_is_refused_by_name(backend: str, example: Example) -> None:
 
 @every_example
 def test_wrong_tensors_are_named(backend: str, example: Example) -> None:
-    """Another rank, dtype, device or type: ``op: argument must <rule>, got <fact>``, from both backends and from the
+    """Another rank, dtype, layout, device or type: ``op: argument must <rule>, got <fact>``, from both backends and from the
     reference when it is called itself."""
     arguments = example.example(6)
     tensors = {name: value for name, value in arguments.items() if isinstance(value, Tensor)}
     for name, value in tensors.items():
-        wrong: dict[str, Any] = {"list": [value.tolist()], "dtype": value.bool()}
+        wrong: dict[str, Any] = {"list": [value.tolist()], "dtype": value.bool(), "layout": value.to_sparse()}
         if value.numel() != 1:  # a number may have any shape
             wrong["rank"] = value[None, None, None]
         if len(tensors) > 1:
@@ -189,7 +189,7 @@ def test_wrong_tensors_are_named(backend: str, example: Example) -> None:
             for function in (example.native, example.reference):
                 with pytest.raises((ValueError, TypeError), match=rf"^{example.op}: ({names}) must .*, got ") as raised:
                     function(**{**arguments, name: replacement})
-                kind = TypeError if what in ("list", "dtype") else ValueError
+                kind = TypeError if what in ("list", "dtype", "layout") else ValueError
                 assert isinstance(raised.value, kind), f"{what} of {name}"
 
 
