@@ -139,11 +139,13 @@ def use_native(op: str, tensor: Tensor) -> bool:
 
 
 def checked(op: Callable[..., Any], *arguments: Any) -> Any:
-    """Calls a compiled op that checks values. Its ValueError passes through torch 2.13 unchanged, and arrives from
-    torch 2.15 as a RuntimeError of the same text."""
+    """Calls a compiled op that checks values. Its ValueError and MemoryError pass through torch 2.13 unchanged, and
+    arrive from torch 2.15 as a RuntimeError of the same text."""
     try:
         return op(*arguments)
     except RuntimeError as error:
+        if "std::bad_alloc" in str(error):
+            raise MemoryError(str(error)) from None
         if " must " in str(error).partition(": ")[2]:
             raise ValueError(str(error)) from None
         raise

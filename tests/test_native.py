@@ -39,6 +39,23 @@ def test_text_of_a_workers_exception_is_kept(native: None, threads: int) -> None
         torch.ops.pred.parallel_probe(out, 1, 63)
 
 
+@pytest.mark.parametrize(
+    "text, kind",
+    [
+        ("knn: k must be at least 1, got 0", ValueError),
+        ("std::bad_alloc", MemoryError),
+        ("something else", RuntimeError),
+    ],
+)
+def test_kernel_errors_of_newer_torch_get_their_type_back(text: str, kind: type[Exception]) -> None:
+    def op() -> None:
+        raise RuntimeError(text)
+
+    with pytest.raises(kind, match=text) as raised:
+        _native.checked(op)
+    assert type(raised.value) is kind
+
+
 def test_direct_calls_are_checked(native: None) -> None:
     bev, grid = torch.zeros(1, 2, 3, 4), torch.zeros(1, 5, 2)
     with pytest.raises(KERNEL_ERROR, match=r"sample_bev: grid must have shape \[1, N, 2\], got \[2, 5, 2\]"):

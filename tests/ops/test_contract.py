@@ -174,8 +174,8 @@ def test_vmap_is_refused_by_name(backend: str, example: Example) -> None:
 
 @every_example
 def test_wrong_tensors_are_named(backend: str, example: Example) -> None:
-    """Another rank, dtype, layout, device or type: ``op: argument must <rule>, got <fact>``, from both backends and from the
-    reference when it is called itself."""
+    """Another rank, dtype, layout, device or type: ``op: argument must <rule>, got <fact>``, from both backends and
+    from the reference when it is called itself."""
     arguments = example.example(6)
     tensors = {name: value for name, value in arguments.items() if isinstance(value, Tensor)}
     for name, value in tensors.items():
