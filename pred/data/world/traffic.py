@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,19 +155,50 @@ def _release(states: list[_State]) -> None:
             state.held = None
 
 
+class _Request(NamedTuple):
+    """Somebody who wants to enter a junction, in the order in which they are answered."""
+
+    asked_s: float
+    order: int
+    state: _State
+    node: Node
+    approach: Node
+
+
 def _grant(states: list[_State], occupants: _Occupants, layout: Layout, crossings: Crossings, time_s: float) -> None:
     """Let vehicles into junctions, those first that have asked first."""
-    asking = []
-    preferred: dict[Node, Node] = {}
+    requests, preferred = _requests(states, occupants, layout, time_s)
+    for request in requests:
+        state, node = request.state, request.node
+        if preferred.get(node, request.approach) != request.approach:
+            continue
+        holders = [other for other in states if other.held == node]
+        if any(other.sections[other.granted].approach != request.approach for other in holders):
+            continue
+        overdue = any(
+            other.node == node and other.approach != request.approach and time_s - other.asked_s > PATIENCE_S
+            for other in requests
+        )
+        if holders and overdue and time_s - request.asked_s <= PATIENCE_S:
+            continue
+        if _has_way(state, occupants, crossings, time_s):
+            state.granted, state.held, state.asked_s = state.section + 1, node, None
+
+
+def _requests(
+    states: list[_State], occupants: _Occupants, layout: Layout, time_s: float
+) -> tuple[list[_Request], dict[Node, Node]]:
+    """Who wants to enter a junction now, and by junction the approach of a driver with priority."""
+    requests, preferred = [], {}
     for order, state in enumerate(states):
         following = state.section + 1
         if following >= len(state.sections) or following <= state.granted or not _is_guarded(state, following, layout):
             continue
-        distance = state.starts[following] - state.front
-        node = state.sections[following].node
+        node, approach = state.sections[following].node, state.sections[following].approach
         assert node is not None
+        distance = state.starts[following] - state.front
         if state.driver.has_priority and distance < LOOK_AHEAD_M and (state.hold_s <= 0 or state.speed < 3.0):
-            preferred[node] = state.sections[following].approach
+            preferred[node] = approach
         if state.hold_s > 0:
             # The first stop of somebody who has to stop: time runs once it stands.
             if state.speed < 0.3:
@@ -178,37 +210,20 @@ def _grant(states: list[_State], occupants: _Occupants, layout: Layout, crossing
         is_first = all(front <= offset or other.held == node for _, front, other in on_lane)
         if is_first and distance < state.speed**2 / (2 * BRAKING_MPS2) + 12.0:
             state.asked_s = time_s if state.asked_s is None else state.asked_s
-            asking.append((state.asked_s, order, state))
-    for asked_s, _, state in sorted(asking, key=lambda entry: entry[:2]):
-        section = state.sections[state.section + 1]
-        node, approach = section.node, section.approach
-        assert node is not None
-        if preferred.get(node, approach) != approach:
-            continue
-        holders = [other for other in states if other.held == node]
-        if any(other.sections[other.granted].approach != approach for other in holders):
-            continue
-        waiting = (
-            time_s - other_s > PATIENCE_S
-            for other_s, _, other in asking
-            if other.sections[other.section + 1].node == node and other.sections[other.section + 1].approach != approach
-        )
-        if holders and any(waiting) and time_s - asked_s <= PATIENCE_S:
-            continue
-        leaving = state.sections[state.section + 2].key
-        # The crossing on this side is passed at once, the one on the other side some seconds later.
-        zebras = (
-            ((approach, node, True), 0.0, NEAR_CLEAR_S),
-            ((section.key[3], node, False), FAR_CLEAR_S[0], FAR_CLEAR_S[1]),
-        )
-        if any(
-            begin < time_s + until_s and time_s + from_s < end
-            for zebra, from_s, until_s in zebras
-            for begin, end in crossings.get(zebra, ())
-        ):
-            continue
-        if any(
-            rear < state.driver.length_m + 3.0 and other.speed < 2.5 for rear, _, other in occupants.get(leaving, ())
-        ):
-            continue
-        state.granted, state.held, state.asked_s = state.section + 1, node, None
+            requests.append(_Request(state.asked_s, order, state, node, approach))
+    return sorted(requests, key=lambda request: (request.asked_s, request.order)), preferred
+
+
+def _has_way(state: _State, occupants: _Occupants, crossings: Crossings, time_s: float) -> bool:
+    """Whether nobody is about to walk where it would drive, and there is room behind the junction."""
+    section, leaving = state.sections[state.section + 1], state.sections[state.section + 2]
+    _, approach, node, after, _ = section.key
+    # The crossing on this side is passed at once, the one on the other side some seconds later.
+    for zebra, from_s, until_s in (
+        ((approach, node, True), 0.0, NEAR_CLEAR_S),
+        ((after, node, False), *FAR_CLEAR_S),
+    ):
+        if any(begin < time_s + until_s and time_s + from_s < end for begin, end in crossings.get(zebra, ())):
+            return False
+    needed_m = state.driver.length_m + 3.0
+    return not any(rear < needed_m and other.speed < 2.5 for rear, _, other in occupants.get(leaving.key, ()))
