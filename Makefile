@@ -25,8 +25,8 @@ WHEEL_CHECKS ?= 2.11.0:$(WHEEL_PYTHON) newest:$(WHEEL_PYTHON)
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 NATIVE := $(shell find csrc -type f) CMakeLists.txt setup.py
-# What nuscenes-devkit imports when its tables and geometry are used; its numpy<2 pin is left aside.
-DEVKIT := cachetools matplotlib opencv-python-headless pyquaternion scikit-learn tqdm
+# What nuscenes-devkit imports when its tables, maps and geometry are used; its numpy<2 pin is left aside.
+DEVKIT := cachetools descartes matplotlib opencv-python-headless pyquaternion scikit-learn shapely tqdm
 
 .PHONY: demo test sanitized sanitize fuzz wheel-check lint format docs bench clean
 .DELETE_ON_ERROR:

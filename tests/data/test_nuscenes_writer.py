@@ -37,7 +37,7 @@ from pred.data.world.nuscenes_writer import (
     _visible_shares,
     make_token,
 )
-from pred.data.world.sensors import MOUNTS, T_EGO_FROM_LIDAR, mounted_camera
+from pred.data.world.sensors import CALIBRATED_MOUNTS, T_EGO_FROM_LIDAR, mounted_camera
 from pred.world import WorldFolderError, make_world
 from tests.data.fake_drive import (
     ACTORS,
@@ -114,7 +114,7 @@ def test_files(root: Path) -> None:
         assert (opened.size, opened.mode, opened.format) == ((WIDTH, HEIGHT), "RGB", "JPEG")
     with Image.open(root / "pseudo" / "exact" / "CAM_FRONT" / f"{image.stem}.png") as label:
         assert (label.size, label.mode) == ((WIDTH, HEIGHT), "L")
-        view = FakeDrive(SEED, 0).view(MOUNTS[0], int(first) - 35_000, WIDTH, HEIGHT)
+        view = FakeDrive(SEED, 0).view(CALIBRATED_MOUNTS[0], int(first) - 35_000, WIDTH, HEIGHT)
         np.testing.assert_array_equal(np.asarray(label), view.class_id)
 
 
@@ -195,10 +195,10 @@ def test_own_reader(root: Path) -> None:
             own = frame.points[frame.is_keyframe]
             np.testing.assert_array_equal(own[:, :4], sweep.points[frame.point_index[frame.is_keyframe], :4])
             assert len(own) == len(sweep.points) - NUM_NO_RETURN
-            assert [camera.name for camera in frame.cameras] == sorted(mount.name for mount in MOUNTS)
+            assert [camera.name for camera in frame.cameras] == sorted(mount.name for mount in CALIBRATED_MOUNTS)
             for camera in frame.cameras:
                 assert camera.load_image().shape == (HEIGHT, WIDTH, 3)
-                mount = next(mount for mount in MOUNTS if mount.name == camera.name)
+                mount = next(mount for mount in CALIBRATED_MOUNTS if mount.name == camera.name)
                 np.testing.assert_allclose(camera.intrinsics, mounted_camera(mount, WIDTH, HEIGHT).intrinsics)
                 assert camera.labels is not None
                 time_us = int(drive.keyframe_us[number]) + drive.camera_offsets_us[camera.name]
@@ -329,7 +329,7 @@ def test_cameras_see_the_points(devkit: Any) -> None:
     drive = FakeDrive(SEED, 0, KEYFRAMES)
     sweep = drive.scan(sample["timestamp"])
     hits = 0
-    for mount in MOUNTS:
+    for mount in CALIBRATED_MOUNTS:
         camera_token = sample["data"][mount.name]
         uv, depth, _ = devkit.explorer.map_pointcloud_to_image(sample["data"]["LIDAR_TOP"], camera_token)
         view = drive.view(mount, devkit.get("sample_data", camera_token)["timestamp"], WIDTH, HEIGHT)
@@ -679,3 +679,29 @@ def test_summary(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     files = [path for folder in ("samples", "sweeps", "lidarseg") for path in (tmp_path / folder).rglob("*.*")]
     num_bytes = sum(path.stat().st_size for path in files if path.is_file())
     assert float(found[1]) == pytest.approx(num_bytes / 4 / 1e6, abs=0.006)
+
+
+def test_a_procedural_drive_is_written_and_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The command on the simulator itself: ten-sweep input from the first keyframe on, and boxes that hold the points
+    of what they stand for."""
+    out = tmp_path / "world"
+    command = ["world", "make", str(out), "--scenes", "1", "--seed", "3", "--keyframes", "1", "--image-scale", "0.1"]
+    assert cli.main([*command, "--exact-labels", "--workers", "1"]) == 0
+    assert "1 scenes, 1 keyframes" in capsys.readouterr().out
+    frame = NuScenesFrames(out, split="all").load(0)
+    assert len(np.unique(frame.points[:, 4])) == 10 and frame.boxes is not None
+    assert [camera.load_image().shape for camera in frame.cameras] == 6 * [(90, 160, 3)]
+    labels = [camera.labels for camera in frame.cameras]
+    assert all(label is not None and len(np.unique(label.class_map())) > 3 for label in labels)
+
+    own = frame.points[frame.is_keyframe, :3].astype(np.float64)
+    (label_file,) = (out / "lidarseg/v1.0-world").iterdir()
+    category = np.fromfile(label_file, dtype=np.uint8)[frame.point_index[frame.is_keyframe]]
+    for kind in ("vehicle.car", "vehicle.truck", "human.pedestrian.adult"):
+        points = own[category == CATEGORIES.index(kind)]
+        inside = np.zeros(len(points), dtype=bool)
+        for row in (row for row, name in enumerate(frame.boxes.names) if name == kind):
+            cosine, sine = np.cos(frame.boxes.yaw_rad[row]), np.sin(frame.boxes.yaw_rad[row])
+            local = (points - frame.boxes.centre_m[row]) @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+            inside |= (np.abs(local) <= frame.boxes.size_m[row] / 2 + 0.1).all(axis=1)  # range noise of 2 cm
+        assert len(points) > 20 and inside.mean() > 0.99, (kind, len(points), inside.mean())

@@ -13,27 +13,24 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from pred.checkpoint import atomic_write, sync_folder, write_text
-from pred.data.frame import MIN_PROJECTION_DEPTH_M, Camera, invert_rigid, transform_points
+from pred.data.frame import MIN_PROJECTION_DEPTH_M, Camera, invert_rigid, quaternion_of, transform_points
 from pred.data.nuscenes import LIDAR_CHANNEL
-from pred.data.world.sensors import MAX_RANGE_M, MOUNTS, T_EGO_FROM_LIDAR, mounted_camera
-
-if TYPE_CHECKING:
-    from pred.data.world.actors import Actor
-    from pred.data.world.drive import Drive, View
-    from pred.data.world.town import TownMap
+from pred.data.world.actors import Actor
+from pred.data.world.drive import CATEGORIES, Drive, View
+from pred.data.world.sensors import CALIBRATED_MOUNTS, MAX_RANGE_M, T_EGO_FROM_LIDAR, mounted_camera
+from pred.data.world.town import TownMap
 
 OFFICIAL_IMAGE_SIZE = (1600, 900)
 JPEG_QUALITY = 90
@@ -42,18 +39,6 @@ REGION_M = 475.0
 """Side of the square of map that each scene has to itself. Towns keep 75 m apart: a BEV grid of 100 m x 100 m around a
 car at the rim of one, whatever its heading, shows nothing of the next."""
 MAP_PIXELS_PER_M = 10
-
-CATEGORIES = (
-    "noise", "animal", "human.pedestrian.adult", "human.pedestrian.child", "human.pedestrian.construction_worker",
-    "human.pedestrian.personal_mobility", "human.pedestrian.police_officer", "human.pedestrian.stroller",
-    "human.pedestrian.wheelchair", "movable_object.barrier", "movable_object.debris",
-    "movable_object.pushable_pullable", "movable_object.trafficcone", "static_object.bicycle_rack", "vehicle.bicycle",
-    "vehicle.bus.bendy", "vehicle.bus.rigid", "vehicle.car", "vehicle.construction", "vehicle.emergency.ambulance",
-    "vehicle.emergency.police", "vehicle.motorcycle", "vehicle.trailer", "vehicle.truck", "flat.driveable_surface",
-    "flat.other", "flat.sidewalk", "flat.terrain", "static.manmade", "static.other", "static.vegetation",
-    "vehicle.ego",
-)  # fmt: skip
-"""Official names by lidarseg index."""
 
 ATTRIBUTES = (
     "vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "cycle.without_rider",
@@ -245,7 +230,7 @@ def write_keyframe(root: Path, settings: WorldSettings, drive: Drive, scene: int
             files.write(_lidarseg_file(settings, token), sweep.category.astype(np.uint8, copy=False).tobytes())
     pictures = []
     for time_us in sweeps_us if settings.sweep_images else [keyframe_us]:
-        for mount in MOUNTS:
+        for mount in CALIBRATED_MOUNTS:
             camera_us = time_us + drive.camera_offsets_us[mount.name]
             view = drive.view(mount, camera_us, *settings.image_size)
             path = files.add(mount.name, camera_us, is_keyframe=time_us == keyframe_us)
@@ -494,7 +479,7 @@ def _add_fixed_rows(tables: _Tables, settings: WorldSettings) -> None:
     for number, level in enumerate(VISIBILITY_LEVELS, start=1):
         tables.add("visibility", token=str(number), level=level, description="")
     _add_sensor(tables, LIDAR_CHANNEL, "lidar", T_EGO_FROM_LIDAR, [])
-    for mount in MOUNTS:
+    for mount in CALIBRATED_MOUNTS:
         camera = mounted_camera(mount, *settings.image_size)
         T_ego_from_camera = T_EGO_FROM_LIDAR @ camera.T_lidar_from_camera
         _add_sensor(tables, mount.name, "camera", T_ego_from_camera, camera.intrinsics.tolist())
@@ -563,7 +548,7 @@ def _add_sample_data(
     parts: Sequence[Part],
     offset: NDArray[np.float64],
 ) -> None:
-    for channel in (LIDAR_CHANNEL, *(mount.name for mount in MOUNTS)):
+    for channel in (LIDAR_CHANNEL, *(mount.name for mount in CALIBRATED_MOUNTS)):
         rows = [
             (sample, row)
             for sample, part in zip(samples, parts, strict=True)
@@ -708,23 +693,9 @@ def _neighbours(tokens: Sequence[str], number: int) -> Row:
 
 def _pose_fields(T_a_from_b: NDArray[np.float64]) -> Row:
     """Translation and quaternion (w, x, y, z) of a rigid transform."""
-    rotation = T_a_from_b[:3, :3]
-    xx, yy, zz = np.diag(rotation)
-    (_, xy, xz), (yx, _, yz), (zx, zy, _) = rotation
-    # Four times the products of the quaternion's components with each other; the row of the largest is the best one.
-    products = np.array(
-        [
-            [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
-            [zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx],
-            [xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy],
-            [yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz],
-        ]
-    )
-    largest = int(np.argmax(np.diag(products)))
-    quaternion = products[largest] / math.sqrt(4 * products[largest, largest])
     return {
         "translation": T_a_from_b[:3, 3].tolist(),
-        "rotation": (quaternion / np.linalg.norm(quaternion)).tolist(),
+        "rotation": quaternion_of(T_a_from_b[:3, :3]).tolist(),
     }
 
 
