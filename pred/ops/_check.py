@@ -127,6 +127,8 @@ def check_flags(op: str, **flags: object) -> None:
 
 def check_choice(op: str, name: str, value: str, choices: Sequence[str]) -> None:
     """``value`` must be one of ``choices``."""
+    if not isinstance(value, str):
+        raise TypeError(f"{op}: {name} must be one of {', '.join(choices)}, got {type(value).__name__}")
     if value not in choices:
         raise ValueError(f"{op}: {name} must be one of {', '.join(choices)}, got {value!r}")
 

@@ -195,6 +195,7 @@ def test_wrong_tensors_are_named(backend: str, example: Example) -> None:
 
 WRONG_PLAIN: dict[type, tuple[Any, ...]] = {
     bool: ("yes", None),
+    str: ("no such", 2, np.zeros(2), None),
     int: (2.5, "2", np.zeros((2, 3), dtype=np.int64), None),
     float: ("2", [2.0], np.array("abc"), torch.tensor(2.0), 10**400),
 }
