@@ -44,10 +44,11 @@ struct Field {
     check_cpu_tensor(op, "points", points_in, 3, dtype);
     check_cpu_tensor(op, "parameters", parameters_in, 1, dtype);
     batch = map_in.size(0);
-    num_samples = batch * points_in.size(1);
     PRED_CHECK(points_in.size(0) == batch && points_in.size(2) == 3, op, ": points must have shape [", batch,
                ", N, 3], got ", shape_text(points_in));
+    num_samples = points_in.numel() / 3;
     const int64_t layers = int64_t(widths.size()) - 1, width = map_in.size(1);
+    PRED_CHECK(width >= 1 && width <= 4096, op, ": projected must have 1 to 4096 channels, got ", width);
     PRED_CHECK(layers >= 2 && layers <= kMaxHidden + 1, op, ": widths must name 2 to ", kMaxHidden + 1, " layers, got ",
                layers);
     PRED_CHECK(octaves >= 0 && octaves <= 16 && widths[0] == 3 + 6 * octaves, op,
@@ -58,7 +59,6 @@ struct Field {
       PRED_CHECK(fits, op, ": widths must be those of projected in hidden layers, and positive, got ", widths[l + 1]);
       expected += widths[l + 1] * (widths[l] + 1);
     }
-    PRED_CHECK(width >= 1 && width <= 4096, op, ": projected must have 1 to 4096 channels, got ", width);
     PRED_CHECK(parameters_in.size(0) == expected, op, ": parameters must have ", expected, " elements, got ",
                parameters_in.size(0));
     PRED_CHECK(point_range.size() == 6, op, ": point_range must hold 6 numbers, got ", point_range.size());

@@ -38,7 +38,7 @@ struct Projection {
     args.inputs = weight.size(1);
     args.outputs = weight.size(0);
     args.rows = storage<S>(bev);
-    cells = bev.size(0) * bev.size(2) * bev.size(3);
+    cells = bev.numel() / args.inputs;
     const ProjectKernels<S>& k = project_bev_kernels<S>();
     const int64_t rows = backward ? args.outputs : args.inputs, columns = backward ? args.inputs : args.outputs;
     const int64_t size = k.packed_size(rows, columns);

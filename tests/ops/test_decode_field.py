@@ -439,6 +439,21 @@ def test_direct_calls_are_checked(native: None) -> None:
         call(bev, points, parameters, [9, 16, 1], *settings[1:], True, True)
     with pytest.raises(KERNEL_ERROR, match="decode_field: beta must lie in .*, got 1e-40"):
         call(bev, points, parameters, *settings[:3], 1e-40, 1.0, True, True)
+    huge = 1 << 62  # products of sizes would overflow before a rule is broken
+    with pytest.raises(
+        KERNEL_ERROR, match=f"decode_field: points must have shape \\[1, N, 3\\], got \\[2, {huge}, 0\\]"
+    ):
+        call(bev, torch.empty(2, huge, 0), parameters, *settings, True, True)
+    with pytest.raises(KERNEL_ERROR, match=f"decode_field: projected must have 1 to 4096 channels, got {huge}"):
+        call(
+            torch.empty_strided((0, huge, 2, 2), (0, 0, 0, 0)),
+            points[:0],
+            parameters,
+            [3, huge, huge, 1],
+            *settings[1:],
+            True,
+            True,
+        )
     with pytest.raises(KERNEL_ERROR, match="decode_field: dtype must be float32, float64 or bfloat16, got Half"):
         call(bev.half(), points, parameters, *settings, True, True)
     with pytest.raises(KERNEL_ERROR, match=r"decode_field_backward: grad_sdf must have shape \[1, 5\], got \[1, 4\]"):
