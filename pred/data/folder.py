@@ -26,7 +26,15 @@ from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from pred.config import did_you_mean
-from pred.data.frame import Camera, Frame, FrameError, check_image_header, invert_rigid
+from pred.data.frame import (
+    Camera,
+    Frame,
+    FrameError,
+    check_image_header,
+    invert_rigid,
+    require_inside,
+    require_intrinsics,
+)
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
 from pred.data.pcd import read_pcd, read_pcd_header
 from pred.data.sweeps import Sweep, accumulate, require_finite_points
@@ -198,7 +206,10 @@ def drive_folders(root: Path, split: str | None = None) -> list[Path]:
         raise ValueError(f"data.split must be one of {', '.join(splits) or 'none'} in {path}, got {split!r}")
     if not splits[split]:
         raise ValueError(f"data.split must select drives of {root}, got none: {split}")
-    return [root / str(name) for name in splits[split]]
+    try:
+        return [root / require_inside(str(name)) for name in splits[split]]
+    except ValueError as error:
+        raise FrameError(path, f"drives must be folders of {root}, got {error}") from None
 
 
 def read_drive(folder: Path) -> Drive:
@@ -393,7 +404,7 @@ def _read_description(path: Path) -> dict[str, Any]:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise FrameError(path, "description must exist, got no such file") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise FrameError(path, f"description must be readable YAML, got {error}") from None
     if not isinstance(content, dict):
         raise FrameError(path, f"description must be a mapping, got {type(content).__name__}")
@@ -432,13 +443,13 @@ def _scans(value: Any) -> tuple[str, list[str]]:
 
 def _camera(name: str, value: Any) -> CameraDescription:
     where = f"cameras: {name}"
-    if Path(name).name != name:
+    if Path(name).name != name or name in ("", ".."):
         raise ValueError(f"{where}: name must be that of a folder in the drive")
     camera = _mapping(value, where, ("width", "height", "intrinsics", "T_camera_from_lidar"))
     for key in ("width", "height"):
         if not isinstance(camera[key], int) or camera[key] < 1:
             raise ValueError(f"{where}: {key} must be a positive whole number, got {camera[key]}")
-    intrinsics = _array(camera["intrinsics"], ((3, 3),), f"{where}: intrinsics")
+    intrinsics = require_intrinsics(camera["intrinsics"], f"{where}: intrinsics")
     given = _array(camera["T_camera_from_lidar"], ((3, 4), (4, 4)), f"{where}: T_camera_from_lidar")
     transform = np.eye(4)
     transform[:3] = given[:3]

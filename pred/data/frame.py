@@ -206,6 +206,34 @@ def transform_points(T_a_from_b: NDArray[np.float64], points_b: NDArray[Any]) ->
     return points_b.astype(np.float64) @ T_a_from_b[:3, :3].T + T_a_from_b[:3, 3]
 
 
+def require_intrinsics(intrinsics: Any, what: str) -> NDArray[np.float64]:
+    """[3, 3] float64: a pinhole camera without zero focal lengths, which would project everything to NaN.
+
+    Raises:
+        ValueError: it opens with ``what``.
+    """
+    try:
+        matrix = np.asarray(intrinsics, dtype=np.float64)
+    except (ValueError, TypeError):
+        matrix = np.zeros(0)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        raise ValueError(f"{what} must be 3 x 3 finite numbers, got {intrinsics}")
+    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and matrix[2].tolist() == [0, 0, 1]):
+        raise ValueError(f"{what} must have positive focal lengths and the last row 0, 0, 1, got {matrix.tolist()}")
+    return matrix
+
+
+def require_inside(path: str) -> str:
+    """A path below the root of a data set.
+
+    Raises:
+        ValueError: it leads elsewhere.
+    """
+    if not path or Path(path).is_absolute() or ".." in Path(path).parts or "\0" in path:
+        raise ValueError(f"{path!r}, which is no path below the root")
+    return path
+
+
 def invert_rigid(T_a_from_b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverse of a rigid transform [4, 4], without the rounding of a general inverse."""
     inverse = np.eye(4)

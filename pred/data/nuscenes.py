@@ -25,6 +25,9 @@ from pred.data.frame import (
     FrameError,
     check_image_header,
     invert_rigid,
+    pose_matrix,
+    require_inside,
+    require_intrinsics,
     transform_points,
 )
 from pred.data.index import (
@@ -186,8 +189,8 @@ class NuScenesFrames:
 
     def _sensor_pose(self, readings: Readings, row: int) -> NDArray[np.float64]:
         """T_world_from_sensor at the time of the measurement."""
-        T_world_from_ego = rigid(self._index.poses[readings.pose[row]])
-        return T_world_from_ego @ rigid(self._index.calibrations.pose[readings.calibration[row]])
+        T_world_from_ego = _rigid(self._index.poses[readings.pose[row]])
+        return T_world_from_ego @ _rigid(self._index.calibrations.pose[readings.calibration[row]])
 
     def _sweeps(self, keyframe: int, T_world_from_lidar: NDArray[np.float64]) -> Iterator[Sweep]:
         """The keyframe's own sweep and those before it."""
@@ -233,7 +236,7 @@ class NuScenesFrames:
         boxes = self._index.boxes
         rows = slice(*boxes.offsets[row : row + 2].tolist())
         T_lidar_from_world = invert_rigid(T_world_from_lidar)
-        poses = [T_lidar_from_world @ rigid(pose) for pose in boxes.pose[rows]]
+        poses = [T_lidar_from_world @ _rigid(pose) for pose in boxes.pose[rows]]
         T_lidar_from_box = np.stack(poses) if poses else np.zeros((0, 4, 4))
         return Boxes(
             centre_m=T_lidar_from_box[:, :3, 3],
@@ -321,8 +324,8 @@ def _read_calibrations(read: _Reader) -> tuple[Calibrations, dict[str, int], lis
     def read_row(row: Row) -> tuple[str, bool, list[float], list[float]]:
         channel, is_camera = sensors[row["sensor_token"]]
         intrinsics = row["camera_intrinsic"]
-        if is_camera and not (np.shape(intrinsics) == (3, 3) and np.isfinite(intrinsics).all()):
-            raise ValueError(f"camera_intrinsic must be 3 x 3 numbers, got {intrinsics}")
+        if is_camera:
+            require_intrinsics(intrinsics, "camera_intrinsic")
         pose = _pose(row)
         _add_row(rows, row["token"])
         return channel, is_camera, pose, np.ravel(intrinsics).tolist() if is_camera else [0.0] * 9
@@ -347,7 +350,7 @@ class _Rows:
 
     def add(self, row: Row, calibration: int, frame: int, width: int = 0, height: int = 0) -> None:
         numbers = array("q", (row["timestamp"], calibration, frame, width, height))
-        path, pose_token = _text(row["filename"]), _text(row["ego_pose_token"])
+        path, pose_token = require_inside(_text(row["filename"])), _text(row["ego_pose_token"])
         # Nothing is kept of a row with a wrong value.
         self.paths.append(path)
         self.pose_tokens.append(pose_token)
@@ -381,7 +384,7 @@ def _read_sample_data(
             image_rows.add(row, calibration, frame_rows[row["sample_token"]], width, height)
         elif channels[calibration] == LIDAR_CHANNEL:
             frame = frame_rows[row["sample_token"]]
-            token, previous = row["token"], row["prev"]
+            token, previous = _text(row["token"]), _text(row["prev"])
             sweep_rows.add(row, calibration, frame if is_keyframe else -1)
             row_of_sweep[token] = len(previous_tokens)
             previous_tokens.append(previous)
@@ -537,17 +540,9 @@ def _pose(row: Row) -> list[float]:
     return pose
 
 
-def rigid(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[4, 4] matrix of a translation and a quaternion (w, x, y, z)."""
-    w, x, y, z = pose[3:] / np.linalg.norm(pose[3:])
-    matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix[:3, 3] = pose[:3]
-    return matrix
+def _rigid(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[4, 4] matrix of a row of poses."""
+    return pose_matrix(pose[:3], pose[3:])
 
 
 def only_table_folder(root: Path) -> Path:

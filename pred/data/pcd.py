@@ -111,6 +111,8 @@ def parse_header(path: Path, content: bytes) -> PcdHeader:
             (name if name != "_" else f"_{number}", _TYPES[kind, item_size], (count,))
             for number, (name, kind, item_size, count) in enumerate(zip(names, kinds, sizes, counts, strict=True))
         ]
+        if not fields or min(counts) < 1:
+            raise ValueError(f"FIELDS {' '.join(names)}, COUNT {' '.join(map(str, counts))}")
         dtype = np.dtype([field if field[2] != (1,) else field[:2] for field in fields])
     except (KeyError, IndexError, ValueError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)

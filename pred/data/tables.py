@@ -126,6 +126,8 @@ def _rows(path: Path, read: Callable[[int], str], advance: Callable[[int], None]
             value, _ = decode(text + read(-1), position)
         except json.JSONDecodeError as error:
             raise broken(error.msg, dropped + error.pos) from None
+        except (ValueError, RecursionError) as error:  # a number of thousands of digits, deep nesting
+            raise broken(_reason(error), dropped + position) from None
         raise FrameError(path, f"table must be a list of rows, got {type(value).__name__}")
     position += 1
     ended = peek() == "]"
@@ -140,8 +142,8 @@ def _rows(path: Path, read: Callable[[int], str], advance: Callable[[int], None]
                 # Perhaps the row goes on behind the chunk.
                 if len(text) - position > CHUNK_CHARACTERS or not refill():
                     raise broken(error.msg, at) from None
-            except RecursionError:
-                raise broken("values nested too deeply", dropped + position) from None
+            except (ValueError, RecursionError) as error:  # a number of thousands of digits, deep nesting
+                raise broken(_reason(error), dropped + position) from None
             else:
                 break
         if not isinstance(row, dict):
@@ -161,6 +163,10 @@ def _unreadable(path: Path, error: OSError, what: str = "table") -> FrameError:
     if isinstance(error, FileNotFoundError):
         return FrameError(path, f"{what} must exist, got no such file")
     return FrameError(path, f"{what} must be readable, got {error}")
+
+
+def _reason(error: ValueError | RecursionError) -> str:
+    return "values nested too deeply" if isinstance(error, RecursionError) else str(error)
 
 
 def _no_json(path: Path, error: object, what: str = "table") -> FrameError:

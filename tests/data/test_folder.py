@@ -94,6 +94,9 @@ def test_splits(tree: OwnTree) -> None:
     (tree.root / "splits.json").write_text('{"train": ["drive-z"], "odd": 3}')
     with pytest.raises(FrameError, match=r"splits\.json: must map split names to lists"):
         FolderFrames(tree.root, split="train")
+    (tree.root / "splits.json").write_text('{"train": ["../elsewhere"]}')
+    with pytest.raises(FrameError, match=r"splits\.json: drives must be folders of .*, got '\.\./elsewhere'"):
+        FolderFrames(tree.root, split="train")
     (tree.root / "splits.json").write_text('{"train": ["drive-z"]}')
     with pytest.raises(FrameError, match=r"drive-z/drive\.yaml: description must exist"):
         FolderFrames(tree.root, split="train")
@@ -204,6 +207,8 @@ CAMERA = {"width": 64, "height": 36, "intrinsics": INTRINSICS, "T_camera_from_li
         ({"scans": {"suffix": ".pcd", "columns": ["x"]}}, "scans: columns must not be given for .pcd files"),
         ({"cameras": {"front": CAMERA | {"width": 0}}}, "cameras: front: width must be a positive whole number, got 0"),
         ({"cameras": {"front": CAMERA | {"fov": 0}}}, "cameras: front: unknown key fov"),
+        ({"cameras": {"..": CAMERA}}, r"cameras: \.\.: name must be that of a folder in the drive"),
+        ({"cameras": {"front": CAMERA | {"intrinsics": [[0] * 3] * 3}}}, "intrinsics must have positive focal lengths"),
         ({"cameras": {"../x": CAMERA}}, r"cameras: \.\./x: name must be that of a folder in the drive"),
         ({"cameras": {"front": CAMERA | {"intrinsics": [[1]]}}}, "cameras: front: intrinsics must be 3 x 3 finite"),
         (

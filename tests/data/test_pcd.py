@@ -140,6 +140,7 @@ def test_lzf_by_hand() -> None:
         ("SIZE 4", "SIZE 3", r"go together, got no \('F', 3\)"),
         ("TYPE F", "TYPE Q", r"go together, got no \('Q', 4\)"),
         ("COUNT 1", "COUNT -1", "go together"),
+        ("COUNT 1", "COUNT 0", "go together"),
         ("FIELDS x y", "FIELDS x x", "go together"),
         ("WIDTH 6", "WIDTH", "go together"),
         ("POINTS 6", "POINTS 7", "POINTS must be WIDTH x HEIGHT"),

@@ -83,6 +83,19 @@ def test_hostile_nesting(tmp_path: Path) -> None:
         list(iterate_rows(write(tmp_path, "[" * 100_000)))
 
 
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ('[{"a": ' + "1" * 5000 + "}]", "Exceeds the limit"),
+        ('{"a": ' + "1" * 5000 + "}", "Exceeds the limit"),
+        ('{"a":' * 100_000, "values nested too deeply"),
+    ],
+)
+def test_what_the_decoder_refuses_in_its_own_words(tmp_path: Path, text: str, reason: str) -> None:
+    with pytest.raises(FrameError, match=rf"rows\.json: table must be valid JSON, got {reason}"):
+        list(iterate_rows(write(tmp_path, text)))
+
+
 def test_a_damaged_row_does_not_bring_the_whole_file_into_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
