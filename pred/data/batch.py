@@ -72,6 +72,9 @@ class DataConfig:
     labels: str | None = "auto"
     """Folder under `root` with <CAMERA>/<image stem>.png|.npy|.npz (ONCE: <sequence>/<camera>/<frame id>.*); auto: the
     only folder under pseudo/; none (or no such folder): LiDAR-only. The street knows auto (exact labels) and none."""
+    image_depth: str | None = None
+    """Folder under `root` with depth maps of the images, <CAMERA>/<image stem>.png (nuscenes) or <drive>/<camera>/
+    <stem>.png (folder): 16-bit PNG, metres = value / 256, 0 = no depth. None or none: no depth."""
     undistort: bool = True
     """Undo the lens distortion of the calibration; False: the images have none any more (once only)."""
     batch_size: int = 4
@@ -104,6 +107,8 @@ class DataConfig:
             raise ValueError(f"data.info must be left out for data.dataset {self.dataset}, got {self.info!r}")
         if self.dataset == "street" and self.labels not in ("auto", "none", None):
             raise ValueError(f"data.labels must be auto or none for the street, got {self.labels!r}")
+        if self.dataset in ("street", "once") and self.image_depth not in (None, "none"):
+            raise ValueError(f"data.image_depth must be none for data.dataset {self.dataset}, got {self.image_depth!r}")
         for name in ("sweeps", "batch_size", "semantic_rays_per_camera", "depth_rays"):
             if getattr(self, name) < 1:
                 raise ValueError(f"data.{name} must be at least 1, got {getattr(self, name)}")
@@ -374,7 +379,12 @@ def build_source(config: DataConfig) -> FrameSource:
         from pred.data.folder import FolderFrames
 
         return FolderFrames(
-            config.root, split=config.split, sweeps=config.sweeps, labels=config.labels, ego_box=config.ego_box
+            config.root,
+            split=config.split,
+            sweeps=config.sweeps,
+            labels=config.labels,
+            ego_box=config.ego_box,
+            image_depth=config.image_depth,
         )
     from pred.data.nuscenes import NuScenesFrames
 
@@ -386,6 +396,7 @@ def build_source(config: DataConfig) -> FrameSource:
         labels=config.labels,
         ego_box=config.ego_box,
         info=config.info,
+        image_depth=config.image_depth,
     )
 
 

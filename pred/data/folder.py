@@ -8,6 +8,7 @@
     ROOT/<drive>/lidar/<stem>.bin | .npy | .pcd
     ROOT/<drive>/<camera>/<stem>.jpg | .jpeg | .png         optional
     ROOT/pseudo/<segmenter>/<drive>/<camera>/<stem>.png | .npy | .npz   optional
+    ROOT/<folder>/<drive>/<camera>/<stem>.png               optional: depth maps of the images
 
 Every scan that ``poses.txt`` names is a frame; the scans before it in the drive are its sweeps.
 """
@@ -35,6 +36,7 @@ from pred.data.frame import (
     require_inside,
     require_intrinsics,
 )
+from pred.data.image_depth import DepthMap, depth_folder
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
 from pred.data.pcd import read_pcd, read_pcd_header
 from pred.data.sweeps import Sweep, accumulate, require_finite_points
@@ -102,6 +104,8 @@ class FolderFrames:
         labels: folder under ``root`` with ``<drive>/<camera>/<stem>.png|.npy|.npz``; "auto" takes the only folder under
             ``pseudo/`` if there is one; "none" reads no labels. With labels, every image and its label must exist.
         ego_box: (x_min, y_min, x_max, y_max) in metres; returns in it are the own car and are removed from each scan.
+        image_depth: folder under ``root`` with depth maps (`pred.data.image_depth`), read when asked for; None or
+            "none": no depth.
 
     Raises:
         FrameError: a description or a pose file is missing or wrong, or a folder cannot be found.
@@ -115,11 +119,13 @@ class FolderFrames:
         sweeps: int = 10,
         labels: str | None = "auto",
         ego_box: tuple[float, float, float, float] = (-1.0, -2.0, 1.0, 3.0),
+        image_depth: str | None = None,
     ) -> None:
         self.root = Path(root)
         self.sweeps = sweeps
         self.ego_box = ego_box
         self.labels = label_folder(self.root, labels)
+        self.depth = depth_folder(self.root, image_depth)
         self.drives = [read_drive(folder) for folder in drive_folders(self.root, split)]
         self._first = np.cumsum([0, *(len(drive.stems) for drive in self.drives)])
 
@@ -181,6 +187,9 @@ class FolderFrames:
             height=camera.height,
             image=image if labels is not None or image.is_file() else None,
             labels=labels,
+            depth=None
+            if self.depth is None
+            else DepthMap(self.depth / drive.folder.name / camera.name / f"{stem}.png", camera.width, camera.height),
         )
 
 

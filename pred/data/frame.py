@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 if TYPE_CHECKING:
+    from pred.data.image_depth import DepthMap
     from pred.data.labels import PseudoLabel
 
 NUM_CLASSES = 19
@@ -62,6 +63,7 @@ class Camera:
         image: file, array [height, width, 3], or a function that makes the array; None where there
             is no image.
         labels: semantic pseudo label of the image, or None.
+        depth: depth map of the image, or None.
     """
 
     name: str
@@ -71,6 +73,7 @@ class Camera:
     height: int
     image: ImageSource | None = None
     labels: PseudoLabel | None = None
+    depth: DepthMap | None = None
 
     def __post_init__(self) -> None:
         self.intrinsics = _matrix(self.intrinsics, 3, f"camera {self.name}: intrinsics")
@@ -98,6 +101,16 @@ class Camera:
         u, v = uv[:, 0], uv[:, 1]
         inside = (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
         return inside & (z_depth_m >= MIN_PROJECTION_DEPTH_M)
+
+    def depth_at(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depth of the image [N] at pixels ``uv`` [N, 2], metres along the optical axis; NaN where it has none.
+
+        Raises:
+            FrameError: there is no depth map, or it is missing, damaged, or of another size or type.
+        """
+        if self.depth is None:
+            raise FrameError(f"camera {self.name}", "depth map must be given, got None: see data.image_depth")
+        return self.depth.lookup(uv)
 
     def load_image(self) -> NDArray[np.uint8]:
         """The image, uint8 [height, width, 3] RGB.

@@ -30,6 +30,7 @@ from pred.data.frame import (
     require_intrinsics,
     transform_points,
 )
+from pred.data.image_depth import DepthMap, depth_folder
 from pred.data.index import (
     Calibrations,
     FrameIndex,
@@ -81,6 +82,8 @@ class NuScenesFrames:
         ego_box: (x_min, y_min, x_max, y_max) in metres; returns in it are the own car and are
             removed from each sweep in the sweep's own frame.
         info: info file of OpenPCDet or mmdetection3d; its samples, in its order, are the frames.
+        image_depth: folder under `root` with depth maps ``<CAMERA>/<image stem>.png`` (`pred.data.image_depth`), read
+            when asked for; None or "none": no depth.
 
     Raises:
         FrameError: a table is missing or damaged, a folder cannot be found, or the info file does not fit the tables.
@@ -96,6 +99,7 @@ class NuScenesFrames:
         labels: str | None = "auto",
         ego_box: tuple[float, float, float, float] = (-1.0, -2.0, 1.0, 3.0),
         info: str | Path | None = None,
+        image_depth: str | None = None,
     ) -> None:
         if split is not None and info is not None:
             raise ValueError(f"data.split must not be given with data.info, which selects the frames, got {split!r}")
@@ -104,6 +108,7 @@ class NuScenesFrames:
         self.sweeps = sweeps
         self.ego_box = ego_box
         self.labels = label_folder(self.root, labels)
+        self.depth = depth_folder(self.root, image_depth)
         self._index = self._open_index()
         self._rows = self._select(split) if info is None else self._select_infos(Path(info))
 
@@ -230,6 +235,7 @@ class NuScenesFrames:
             height=height,
             image=image if labels is not None or image.is_file() else None,
             labels=labels,
+            depth=None if self.depth is None else DepthMap(self.depth / channel / f"{image.stem}.png", width, height),
         )
 
     def _boxes(self, row: int, T_world_from_lidar: NDArray[np.float64]) -> Boxes:
