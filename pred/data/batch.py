@@ -5,6 +5,7 @@
 # No `from __future__ import annotations`: jsonargparse reads the field types of DataConfig.
 
 import ctypes
+import math
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -23,9 +24,11 @@ from pred.data.masking import visible_points
 from pred.data.rays import (
     NEAR_M,
     DepthCandidates,
+    DepthTolerance,
     DepthView,
     FrameCandidates,
     SemanticCandidates,
+    SemanticView,
     draw_class_balanced,
     draw_uniform,
     frame_candidates,
@@ -91,6 +94,12 @@ class DataConfig:
     """Depth rays drawn for every frame."""
     depth_view: DepthView = "lidar"
     """Depth rays start at the LiDAR (target: range) or at the cameras (target: z-depth)."""
+    semantic_view: SemanticView = "camera"
+    """Semantic rays start at the cameras, or (direct projection, an ablation) at the LiDAR: to a return, with the label
+    of the pixel that it projects to."""
+    depth_filter: DepthTolerance | None = None
+    """[absolute m, relative]: only returns whose depth differs by at most absolute + relative x depth from that of
+    `image_depth` have a label. None: no filter."""
     class_counts: Literal["batch", "dataset"] = "batch"
     """Where class frequencies for balanced sampling are counted; dataset reads every frame once."""
     on_error: Literal["raise", "skip"] = "raise"
@@ -114,6 +123,11 @@ class DataConfig:
                 raise ValueError(f"data.{name} must be at least 1, got {getattr(self, name)}")
         if self.workers < 0:
             raise ValueError(f"data.workers must be at least 0, got {self.workers}")
+        if self.depth_filter is not None:
+            if self.image_depth in (None, "none"):
+                raise ValueError("data.depth_filter must be given with data.image_depth, got no image depth")
+            if not all(math.isfinite(limit) and limit >= 0 for limit in self.depth_filter):
+                raise ValueError(f"data.depth_filter must be (absolute m, relative), got {self.depth_filter}")
         for name in ("mask_ratio", "holdout_fraction"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"data.{name} must be in [0, 1), got {getattr(self, name)}")
@@ -424,13 +438,15 @@ def evaluation_batch(
 ) -> Batch:
     """Batch of one frame whose rays aim at all held-out returns, each once.
 
-    The visible points are a fixed mask of ``seed`` and the frame. Depth rays are those of the LiDAR
-    view; a return that two cameras see gives two semantic rays. Jitter is 0.5 (no randomness).
+    The visible points are a fixed mask of ``seed`` and the frame. Whatever views and filter the run trains with, depth
+    rays are those of the LiDAR view and semantic rays those of the cameras; a return that two cameras see gives two.
+    Jitter is 0.5 (no randomness).
 
     Raises:
         FrameError: a pseudo label cannot be used.
     """
-    candidates = _candidates(frame, replace(config, depth_view="lidar"), point_range, near_m, held_out=True)
+    views = replace(config, depth_view="lidar", semantic_view="camera", depth_filter=None)
+    candidates = _candidates(frame, views, point_range, near_m, held_out=True)
     rng = numpy_generator(seed, frame.token, "evaluation mask")
     visible = visible_points(len(candidates.points), config.mask_ratio, rng)
     semantic = join_cameras(candidates.semantic)
@@ -497,6 +513,8 @@ def _candidates(
         depth_view=config.depth_view,
         held_out=held_out,
         near_m=near_m,
+        semantic_view=config.semantic_view,
+        depth_filter=config.depth_filter,
     )
 
 

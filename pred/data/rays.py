@@ -6,6 +6,10 @@ Two populations that are never mixed: depth rays towards LiDAR returns, and sema
 cameras through the pixels that LiDAR returns project to (PRED section 3.2). Both use the keyframe's
 own returns inside the range box and outside the ego box. The held-out returns among them are for
 evaluation only; the encoder never sees those either, not even in a later frame's sweeps.
+
+For the paper's ablation "Neural Rendering" the same labels may be projected directly instead: rays
+from the LiDAR to the returns, each with the label of the pixel that its return projects to, whatever
+stands before it there, or only where the depth of the image agrees.
 """
 
 from __future__ import annotations
@@ -23,6 +27,10 @@ NEAR_M = 1.0
 """Default distance, metres, from which rays are rendered: nearer returns are no targets."""
 
 DepthView = Literal["lidar", "image"]
+SemanticView = Literal["camera", "lidar"]
+
+DepthTolerance = tuple[float, float]
+"""(absolute, relative): depths agree that differ by at most absolute + relative x image depth, metres."""
 
 
 class DepthCandidates(NamedTuple):
@@ -45,7 +53,7 @@ class SemanticCandidates(NamedTuple):
     """N labelled pixels of one camera as rays in the LiDAR frame.
 
     Attributes:
-        origins: [N, 3] float32, the camera centre, metres.
+        origins: [N, 3] float32, the camera centre (in the LiDAR view the LiDAR), metres.
         directions: [N, 3] float32, unit length, through the LiDAR return.
         target: [N, 19] float32 class probabilities.
         confidence: [N] float32, the largest probability.
@@ -88,6 +96,8 @@ def frame_candidates(
     depth_view: DepthView = "lidar",
     held_out: bool = False,
     near_m: float = NEAR_M,
+    semantic_view: SemanticView = "camera",
+    depth_filter: DepthTolerance | None = None,
 ) -> FrameCandidates:
     """Split a frame into what the encoder may see and what rays may aim at.
 
@@ -99,9 +109,13 @@ def frame_candidates(
         depth_view: where depth rays start.
         held_out: False: rays for training; True: rays towards the held-out returns.
         near_m: rays are rendered from this distance on, so nearer returns are no targets, metres.
+        semantic_view: where semantic rays start. A return that several cameras see gives one ray for each of them in
+            which it has a label.
+        depth_filter: with a tolerance, a return has a label only where its z-depth agrees with the depth map of the
+            image; where that has no depth, nothing agrees.
 
     Raises:
-        FrameError: a pseudo label cannot be used.
+        FrameError: a pseudo label or a depth map cannot be used.
     """
     held = frame.is_keyframe & is_held_out(frame.point_index, frame.token, holdout_fraction)
     hidden = held.copy()
@@ -120,7 +134,11 @@ def frame_candidates(
         token=frame.token,
         points=frame.points[inside & ~hidden],
         depth=depth,
-        semantic=[_semantic(returns, camera, near_m) for camera in frame.cameras if camera.labels is not None],
+        semantic=[
+            _semantic(returns, camera, near_m, semantic_view, depth_filter)
+            for camera in frame.cameras
+            if camera.labels is not None
+        ],
     )
 
 
@@ -151,22 +169,38 @@ def _image_view(returns: NDArray[np.float64], cameras: list[Camera], near_m: flo
     return DepthCandidates(rays[:, :3], rays[:, 3:6], rays[:, 6], rays[:, 7])
 
 
-def _semantic(returns: NDArray[np.float64], camera: Camera, near_m: float) -> SemanticCandidates:
+def _semantic(
+    returns: NDArray[np.float64],
+    camera: Camera,
+    near_m: float,
+    view: SemanticView,
+    depth_filter: DepthTolerance | None,
+) -> SemanticCandidates:
     assert camera.labels is not None
-    centre = camera.T_lidar_from_camera[:3, 3]
+    origin = camera.T_lidar_from_camera[:3, 3] if view == "camera" else np.zeros(3)
     uv, z_depth_m = camera.project(returns)
-    directions, distance_m = _unit(returns, centre)
+    directions, distance_m = _unit(returns, origin)
     seen = np.flatnonzero(camera.in_image(uv, z_depth_m) & (distance_m > near_m))
+    if depth_filter is not None:
+        seen = seen[depths_agree(z_depth_m[seen], camera.depth_at(uv[seen]), depth_filter)]
     labels = camera.labels.lookup(uv[seen])
     labelled = labels.class_id >= 0
     num_rays = int(np.count_nonzero(labelled))
     return SemanticCandidates(
-        origins=np.broadcast_to(centre.astype(np.float32), (num_rays, 3)),
+        origins=np.broadcast_to(origin.astype(np.float32), (num_rays, 3)),
         directions=directions[seen[labelled]].astype(np.float32),
         target=labels.target[labelled],
         confidence=labels.confidence[labelled],
         class_id=labels.class_id[labelled],
     )
+
+
+def depths_agree(
+    z_depth_m: NDArray[np.float64], image_depth_m: NDArray[np.float64], tolerance: DepthTolerance
+) -> NDArray[np.bool_]:
+    """[N] mask of depths within (absolute, relative) of the image's; False where that is NaN."""
+    absolute_m, relative = tolerance
+    return np.abs(z_depth_m - image_depth_m) <= absolute_m + relative * image_depth_m
 
 
 def _unit(points: NDArray[np.float64], origin: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -4,14 +4,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
-from pred.data.frame import Camera, Frame
+from pred.data.frame import Camera, Frame, FrameError
+from pred.data.image_depth import DepthMap
 from pred.data.labels import PseudoLabel
 from pred.data.masking import is_held_out
-from pred.data.rays import DepthView, draw_class_balanced, draw_uniform, frame_candidates
+from pred.data.rays import DepthView, SemanticView, depths_agree, draw_class_balanced, draw_uniform, frame_candidates
 from pred.random import numpy_generator
 
 POINT_RANGE = (-20.0, -20.0, -3.0, 20.0, 20.0, 3.0)
@@ -19,6 +23,8 @@ EGO_BOX = (-1.0, -2.0, 1.0, 3.0)
 # The camera sits 1 m ahead of the LiDAR, looks along +y, and its axes are turned accordingly.
 T_CAMERA_FROM_LIDAR = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, -1.0], [0, 0, 0, 1.0]])
 INTRINSICS = np.array([[50.0, 0, 50.0], [0, 50.0, 25.0], [0, 0, 1.0]])
+
+VIEWS: tuple[SemanticView, ...] = ("camera", "lidar")
 
 
 def make_frame(
@@ -133,6 +139,89 @@ def test_semantic_rays_pass_through_their_returns() -> None:
     assert set(found.class_id) == {0, 8, 13}
     assert np.array_equal(found.target.argmax(axis=1), found.class_id)
     assert (found.confidence == 1).all()
+
+
+# Direct projection: a return 4 m before the camera, one behind it in the same pixel, one in another pixel.
+IN_LINE = [[0.0, 5.0, 0.0], [0.0, 9.0, 0.0], [2.0, 5.0, 1.0]]
+PIXELS = [[50.0, 25.0], [50.0, 25.0], [75.0, 12.5]]
+
+
+def projection_frame(tmp_path: Path, depth_m: tuple[float, float] = (4.0, 4.0)) -> Frame:
+    classes = np.full((50, 100), 13, dtype=np.uint8)
+    classes[12, 75] = 2
+    depth = np.zeros((50, 100), dtype=np.uint16)
+    depth[25, 50], depth[12, 75] = np.array(depth_m) * 256
+    Image.fromarray(depth).save(tmp_path / "depth.png")
+    frame = make_frame(IN_LINE, classes)
+    np.testing.assert_allclose(frame.cameras[0].project(frame.points[:, :3])[0], PIXELS)
+    frame.cameras[0].depth = DepthMap(tmp_path / "depth.png", 100, 50)
+    return frame
+
+
+def test_direct_projection_hand_computed(tmp_path: Path) -> None:
+    frame = projection_frame(tmp_path)
+    found = frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.0, semantic_view="lidar").semantic[0]
+    assert not found.origins.any() and found.origins.shape == (3, 3)
+    np.testing.assert_allclose(found.directions, IN_LINE / np.linalg.norm(IN_LINE, axis=1)[:, None], rtol=1e-6)
+    # The return behind has the label of what the camera sees before it.
+    assert found.class_id.tolist() == [13, 13, 2]
+    by_camera = frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.0).semantic[0]
+    assert np.array_equal(found.target, by_camera.target) and (by_camera.origins == [0.0, 1.0, 0.0]).all()
+    assert [column.dtype for column in found] == [column.dtype for column in by_camera]
+
+
+@pytest.mark.parametrize("view", ["camera", "lidar"])
+def test_depth_filter_hand_computed(tmp_path: Path, view: SemanticView) -> None:
+    def kept(depth_m: tuple[float, float], tolerance: tuple[float, float]) -> list[int]:
+        frame = projection_frame(tmp_path, depth_m)
+        found = frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.0, semantic_view=view, depth_filter=tolerance).semantic[
+            0
+        ]
+        offset = np.array(IN_LINE) - (found.origins[0] if len(found.origins) else 0)
+        direction = offset / np.linalg.norm(offset, axis=1)[:, None]
+        return [int(np.abs(direction - ray).sum(axis=1).argmin()) for ray in found.directions]
+
+    # Depths of the returns: 4, 8 and 4 m.
+    assert kept((4.0, 4.0), (0.0, 0.0)) == [0, 2]
+    assert kept((4.5, 3.5), (0.5, 0.0)) == [0, 2]
+    assert kept((4.5, 3.5), (0.49, 0.0)) == []
+    assert kept((4.0, 5.0), (0.5, 0.1)) == [0, 2]  # 1 m at 5 m
+    assert kept((4.0, 3.0), (0.5, 0.1)) == [0]  # but 0.8 m at 3 m
+    assert kept((4.0, 0.0), (100.0, 1.0))[-1:] != [2]  # no depth
+
+
+def test_depth_filter_needs_depth() -> None:
+    frame = make_frame(IN_LINE, np.full((50, 100), 13, dtype=np.uint8))
+    with pytest.raises(FrameError, match="camera CAM: depth map must be given"):
+        frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.0, depth_filter=(0.5, 0.0))
+
+
+def test_depths_agree() -> None:
+    z_depth_m, image_m = np.full(3, 10.0), np.array([11.5, 8.5, np.nan])
+    assert depths_agree(z_depth_m, image_m, (0.35, 0.1)).tolist() == [True, False, False]
+
+
+def test_a_return_has_a_ray_for_each_camera_that_labels_it() -> None:
+    frame = make_frame(IN_LINE, np.full((50, 100), 13, dtype=np.uint8))
+    unlabelled = np.full((50, 100), 255, dtype=np.uint8)
+    unlabelled[25, 50] = 2
+    second = Camera("CAM-2", INTRINSICS, T_CAMERA_FROM_LIDAR, 100, 50, labels=PseudoLabel(unlabelled, 100, 50))
+    frame.cameras.append(second)
+    found = frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.0, semantic_view="lidar").semantic
+    assert [camera.class_id.tolist() for camera in found] == [[13, 13, 13], [2, 2]]
+    assert np.array_equal(found[0].directions[:2], found[1].directions)
+
+
+@pytest.mark.parametrize("near_m", [4.5, 6.0])
+def test_near_m_counts_from_the_origin_of_the_ray(near_m: float) -> None:
+    frame = make_frame(IN_LINE, np.full((50, 100), 13, dtype=np.uint8))
+    by_view = {
+        view: len(
+            frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.0, near_m=near_m, semantic_view=view).semantic[0].class_id
+        )
+        for view in VIEWS
+    }
+    assert by_view == ({"camera": 2, "lidar": 3} if near_m == 4.5 else {"camera": 1, "lidar": 1})
 
 
 def test_class_counts() -> None:
