@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from pred.data.frame import NUM_CLASSES, Frame, FrameError, FrameSource
-from pred.data.masking import visible_points
+from pred.data.masking import MaskStrategy, bev_patches, farthest_point_groups, visible_parts, visible_points
 from pred.data.rays import (
     NEAR_M,
     DepthCandidates,
@@ -83,7 +83,13 @@ class DataConfig:
     batch_size: int = 4
     """Frames per batch and process."""
     mask_ratio: float = 0.95
-    """Share of the points inside the range that the encoder does not see, in [0, 1)."""
+    """Share of the points inside the range (patches, groups) that the encoder does not see, in [0, 1)."""
+    mask_strategy: MaskStrategy = "point"
+    """What is hidden: points, whole patches of a BEV grid, or groups of points around far-apart centres."""
+    mask_patch_m: float = 0.8
+    """Edge of a patch, metres; 0.8 is a cell of the default encoder's BEV map (patch only)."""
+    mask_groups: int = 2048
+    """Groups of a frame (group only)."""
     holdout_fraction: float = 0.1
     """Share of the keyframe returns that training never uses, neither as input nor as target."""
     ego_box: tuple[float, float, float, float] = (-1.0, -2.0, 1.0, 3.0)
@@ -118,7 +124,9 @@ class DataConfig:
             raise ValueError(f"data.labels must be auto or none for the street, got {self.labels!r}")
         if self.dataset in ("street", "once") and self.image_depth not in (None, "none"):
             raise ValueError(f"data.image_depth must be none for data.dataset {self.dataset}, got {self.image_depth!r}")
-        for name in ("sweeps", "batch_size", "semantic_rays_per_camera", "depth_rays"):
+        if not (math.isfinite(self.mask_patch_m) and self.mask_patch_m > 0):
+            raise ValueError(f"data.mask_patch_m must be positive, got {self.mask_patch_m}")
+        for name in ("sweeps", "batch_size", "semantic_rays_per_camera", "depth_rays", "mask_groups"):
             if getattr(self, name) < 1:
                 raise ValueError(f"data.{name} must be at least 1, got {getattr(self, name)}")
         if self.workers < 0:
@@ -284,7 +292,8 @@ class TrainingBatches(Dataset[Batch]):
         if class_counts is None:
             class_counts = np.sum([frame.class_counts() for frame in frames], axis=0)
         draws = [
-            _draw(frame, class_counts, self.config, self.seed, slot) for frame, slot in zip(frames, slots, strict=True)
+            _draw(frame, class_counts, self.config, self.point_range, self.seed, slot)
+            for frame, slot in zip(frames, slots, strict=True)
         ]
         num_cameras = max(len(frame.semantic) for frame in frames)
         return _collate(
@@ -438,7 +447,8 @@ def evaluation_batch(
 ) -> Batch:
     """Batch of one frame whose rays aim at all held-out returns, each once.
 
-    The visible points are a fixed mask of ``seed`` and the frame. Whatever views and filter the run trains with, depth
+    The visible points are a fixed mask of ``seed`` and the frame, of the run's own strategy and ratio: what the encoder
+    was trained to see. Whatever views and filter the run trains with, depth
     rays are those of the LiDAR view and semantic rays those of the cameras; a return that two cameras see gives two.
     Jitter is 0.5 (no randomness).
 
@@ -448,7 +458,7 @@ def evaluation_batch(
     views = replace(config, depth_view="lidar", semantic_view="camera", depth_filter=None)
     candidates = _candidates(frame, views, point_range, near_m, held_out=True)
     rng = numpy_generator(seed, frame.token, "evaluation mask")
-    visible = visible_points(len(candidates.points), config.mask_ratio, rng)
+    visible = _visible(candidates.points, config, point_range, rng)
     semantic = join_cameras(candidates.semantic)
     draw = _Draw(
         token=frame.token,
@@ -518,17 +528,31 @@ def _candidates(
     )
 
 
+def _visible(
+    points: NDArray[np.float32], config: DataConfig, point_range: PointRange, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Ascending indices of the points that the encoder sees."""
+    if config.mask_strategy == "point":
+        return visible_points(len(points), config.mask_ratio, rng)
+    if config.mask_strategy == "patch":
+        parts = bev_patches(points, point_range, config.mask_patch_m)
+    else:
+        parts = farthest_point_groups(points, config.mask_groups, rng)
+    return visible_parts(parts, config.mask_ratio, rng)
+
+
 def _draw(
     frame: FrameCandidates,
     class_counts: NDArray[np.int64],
     config: DataConfig,
+    point_range: PointRange,
     seed: int,
     slot: int,
 ) -> _Draw:
     def rng(purpose: str) -> np.random.Generator:
         return numpy_generator(seed, slot, frame.token, purpose)
 
-    visible = visible_points(len(frame.points), config.mask_ratio, rng("mask"))
+    visible = _visible(frame.points, config, point_range, rng("mask"))
     depth = frame.depth
     if len(depth.depth_m):
         chosen = draw_uniform(len(depth.depth_m), config.depth_rays, rng("depth rays"))

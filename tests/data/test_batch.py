@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -31,6 +31,7 @@ from pred.data.labels import PseudoLabel
 from pred.data.masking import is_held_out
 from pred.data.nuscenes import NuScenesFrames
 from pred.data.rays import NEAR_M, frame_candidates
+from pred.data.world import StreetConfig, StreetFrames
 from pred.models.renderer import RendererConfig
 from tests.data.tiny_tree import NUM_LANDMARKS, Tree, write_tree
 
@@ -159,6 +160,27 @@ def test_visible_points_are_a_share_of_the_candidates(tree: Tree) -> None:
         assert len(np.unique(visible[:, 4])) == (2 if token == tree.tokens[0] else 4)
 
 
+def test_whole_patches_and_groups_are_hidden(tree: Tree) -> None:
+    by_strategy = {}
+    for strategy in ("point", "patch", "group"):
+        config = tree_config(tree, mask_strategy=strategy, mask_patch_m=5.0, mask_groups=40, batch_size=1)
+        batches = TrainingBatches(config, POINT_RANGE, seed=0, total_steps=2)
+        by_strategy[strategy] = [batches[step] for step in range(2)]
+    for step, batch in enumerate(by_strategy["patch"]):
+        candidates = batches._candidates(tree.tokens.index(batch.tokens[0])).points
+        patches = np.floor((candidates[:, :2] + 25.0) / 5.0) @ [1, 100]
+        shown = {point.tobytes() for point in batch.points.numpy()}
+        visible = np.array([point.tobytes() in shown for point in candidates])
+        assert len(np.unique(patches[visible])) == round(0.2 * len(np.unique(patches)))
+        assert not np.isin(patches[~visible], patches[visible]).any() and 0 < visible.sum() < len(visible)
+        others = [by_strategy[strategy][step] for strategy in ("point", "group")]
+        assert len({other.points.numpy().tobytes() for other in (batch, *others)}) == 3
+        # The strategy changes nothing but the input.
+        for other in others:
+            assert torch.equal(other.depth.directions, batch.depth.directions)
+            assert torch.equal(other.depth.jitter, batch.depth.jitter)
+
+
 def test_held_out_returns_are_no_input_of_the_next_keyframe(tree: Tree) -> None:
     frames = NuScenesFrames(tree.root)
     first, second = frames.load(0), frames.load(1)
@@ -245,6 +267,67 @@ def test_classes_are_balanced_over_the_batch() -> None:
     assert batches._candidates(0).class_counts()[13] < 0.3 * batches._candidates(0).class_counts()[0]
 
 
+class StreetLabels:
+    """The street's frames, with labels made of its exact ones."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        self.frames = StreetFrames(StreetConfig(frames=2, image_width=160, image_height=90))
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def token(self, index: int) -> str:
+        return self.frames.token(index)
+
+    def load(self, index: int) -> Frame:
+        frame = self.frames.load(index)
+        for camera in frame.cameras:
+            assert camera.labels is not None
+            classes = camera.labels.class_map()
+            if self.kind == "some":
+                classes[::2] = 255
+            camera.labels = PseudoLabel(probabilities(classes) if self.kind == "soft" else classes, 160, 90)
+        return frame
+
+
+def probabilities(classes: np.ndarray) -> np.ndarray:
+    """[19, h, w]: 0.6 for the class, 0.4 for the next; 0 where there is none."""
+    found = np.zeros((19, *classes.shape), dtype=np.float32)
+    for offset, probability in ((0, 0.6), (1, 0.4)):
+        np.put_along_axis(found, (classes[None].astype(int) + offset) % 19, probability, axis=0)
+    return np.where(classes == 255, 0, found)
+
+
+@pytest.mark.parametrize("class_counts", ["batch", "dataset"])
+@pytest.mark.parametrize("kind", ["hard", "soft", "some"])
+def test_drawn_classes_follow_the_inverse_frequency(kind: str, class_counts: Literal["batch", "dataset"]) -> None:
+    source = StreetLabels(kind)
+    config = DataConfig(
+        dataset="street", batch_size=1, workers=0, semantic_rays_per_camera=1, depth_rays=1, class_counts=class_counts
+    )
+    batches = TrainingBatches(config, POINT_RANGE, seed=0, total_steps=1000, source=source)
+    frames = [batches._candidates(index) for index in range(2)]
+    per_frame = [frame.class_counts() for frame in frames]
+    drawn, expected = np.zeros(19), np.zeros(19)
+    # With one ray per camera, nothing runs out: the shares are the weights.
+    for step in range(1000):
+        batch = batches[step]
+        index = [source.token(0), source.token(1)].index(batch.tokens[0])
+        assert batch.semantic is not None
+        drawn += np.bincount(batch.semantic.target[batch.semantic.valid].argmax(-1), minlength=19)
+        # The paper's rule: the probability of a pixel is inverse to the number of points of its class.
+        counts = per_frame[index] if class_counts == "batch" else per_frame[0] + per_frame[1]
+        for camera in frames[index].semantic:
+            weight = np.bincount(camera.class_id, minlength=19) / np.maximum(counts, 1)
+            expected += weight / weight.sum()
+    assert drawn.sum() == pytest.approx(expected.sum())
+    assert np.abs(drawn - expected).max() < 5 * np.sqrt(expected.max())
+    # Without balance the commonest class would have several times as many rays.
+    common = (per_frame[0] + per_frame[1]).argmax()
+    assert drawn[common] / drawn.sum() < 0.5 * (per_frame[0] + per_frame[1])[common] / sum(map(sum, per_frame))
+
+
 def test_dataset_class_counts(tree: Tree) -> None:
     config = tree_config(tree, class_counts="dataset")
     batches = TrainingBatches(config, POINT_RANGE, seed=0, total_steps=1)
@@ -264,8 +347,9 @@ def test_to_moves_every_tensor(tree: Tree) -> None:
 # Repeatability
 
 
-def test_workers_and_restarts_give_the_same_bits(tree: Tree) -> None:
-    config = tree_config(tree)
+@pytest.mark.parametrize("strategy", ["point", "patch", "group"])
+def test_workers_and_restarts_give_the_same_bits(tree: Tree, strategy: str) -> None:
+    config = tree_config(tree, mask_strategy=strategy, mask_groups=40)
     expected = [TrainingBatches(config, POINT_RANGE, 7, 6)[step] for step in range(6)]
     for workers in (0, 1, 2):
         loader = make_loader(TrainingBatches(config, POINT_RANGE, 7, 6), workers=workers)
@@ -532,6 +616,21 @@ def test_evaluation_batch_uses_every_held_out_return_once(tree: Tree) -> None:
     assert torch.equal(other.depth.directions, batch.depth.directions)
 
 
+def test_evaluation_is_that_of_camera_rays_whatever_a_run_trains_with(tree: Tree) -> None:
+    (tree.root / "depth").mkdir()
+    frame = build_source(tree_config(tree)).load(1)
+    expected = evaluation_batch(frame, tree_config(tree), POINT_RANGE, seed=0)
+    projection = tree_config(tree, semantic_view="lidar", image_depth="depth", depth_filter=(0.5, 0.0))
+    # The depth maps are not there: nobody asks for them.
+    found = evaluation_batch(build_source(projection).load(1), projection, POINT_RANGE, seed=0)
+    assert_equal(found, expected)
+    # The input is what the encoder was trained to see.
+    patches = tree_config(tree, mask_strategy="patch", mask_patch_m=5.0)
+    found = evaluation_batch(frame, patches, POINT_RANGE, seed=0)
+    assert not torch.equal(found.points, expected.points)
+    assert torch.equal(found.depth.directions, expected.depth.directions)
+
+
 def test_evaluation_batch_with_nothing_held_out() -> None:
     config = dataclasses.replace(SMALL, holdout_fraction=0.0)
     batch = evaluation_batch(memory_frame(), config, POINT_RANGE, seed=0)
@@ -553,6 +652,14 @@ def test_evaluation_batch_with_nothing_held_out() -> None:
         ({"depth_rays": 0}, r"data\.depth_rays must be at least 1"),
         ({"mask_ratio": 1.0}, r"data\.mask_ratio must be in \[0, 1\), got 1\.0"),
         ({"holdout_fraction": -0.1}, r"data\.holdout_fraction must be in \[0, 1\), got -0\.1"),
+        ({"mask_groups": 0}, r"data\.mask_groups must be at least 1, got 0"),
+        ({"mask_patch_m": 0.0}, r"data\.mask_patch_m must be positive, got 0\.0"),
+        ({"mask_patch_m": float("nan")}, r"data\.mask_patch_m must be positive, got nan"),
+        ({"depth_filter": (0.5, 0.0)}, r"data\.depth_filter must be given with data\.image_depth, got no image depth"),
+        (
+            {"depth_filter": (0.5, -0.1), "image_depth": "depth"},
+            r"data\.depth_filter must be \(absolute m, relative\), got \(0\.5, -0\.1\)",
+        ),
         ({"workers": -1}, r"data\.workers must be at least 0, got -1"),
         ({"ego_box": (1.0, 0.0, -1.0, 0.0)}, r"data\.ego_box must be \(x_min"),
         (
