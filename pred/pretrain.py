@@ -5,6 +5,7 @@
 # No `from __future__ import annotations`: jsonargparse reads the field types of the configurations.
 
 import dataclasses
+import hashlib
 import math
 import os
 import signal
@@ -28,7 +29,7 @@ from pred import __version__
 from pred.checkpoint import CheckpointError, LatestCheckpoint, load_latest, load_tensors, save_checkpoint, save_tensors
 from pred.config import flatten, plain, to_yaml
 from pred.data.batch import Batch, DataConfig, PointRange, TrainingBatches, build_source, make_loader
-from pred.data.frame import NUM_CLASSES
+from pred.data.frame import NUM_CLASSES, FrameSource
 from pred.losses import LossConfig
 from pred.models.encoders.pillars import PillarEncoderConfig
 from pred.models.field import FieldConfig
@@ -39,10 +40,11 @@ from pred.random import seed_of
 from pred.run_folder import CsvLog, RunFolder
 
 FREE_KEYS = {
-    "run", "data.root", "data.workers", "train.accelerator", "train.log_every",
+    "run", "data.root", "data.info", "data.workers", "train.accelerator", "train.log_every",
     "train.checkpoint_every", "train.keep_checkpoints",
 }  # fmt: skip
-"""Keys that a resumed run may change: they leave its bits alone, or lie with the user (accelerator)."""
+"""Keys that a resumed run may change: they leave its bits alone, or lie with the user (accelerator). Files may move;
+that they still name the same frames is checked by `frames_digest`."""
 
 RECALIBRATION_BATCHES = 16
 """Batches whose average makes the final batch normalisation statistics; 4 and 64 were found to do as well."""
@@ -176,6 +178,7 @@ def pretrain(config: PretrainConfig, resume: bool = False) -> Path:
         config.renderer.near_m,
     )
     model = build_model(config)
+    frames = frames_digest(source)
 
     latest = None
     if fabric.is_global_zero:
@@ -184,7 +187,7 @@ def pretrain(config: PretrainConfig, resume: bool = False) -> Path:
         else:
             folder.start(to_yaml(config))
     if resume:
-        latest = latest_checkpoint(folder, config, total_steps)
+        latest = latest_checkpoint(folder, config, total_steps, frames)
     first_step, skipped_frames = 0, 0
     if latest is not None:
         model.load_state_dict(latest.state["model"])
@@ -210,6 +213,7 @@ def pretrain(config: PretrainConfig, resume: bool = False) -> Path:
                 "optimizer": optimizer.state_dict(),
                 "skipped_frames": skipped_frames,
                 "total_steps": total_steps,
+                "frames": frames,
                 "config": plain(config),
                 "versions": {"pred": __version__, "torch": str(torch.__version__)},
             }
@@ -360,11 +364,21 @@ def set_schedule(optimizer: Optimizer, train: TrainConfig, share_done: float) ->
     return learning_rate
 
 
-def latest_checkpoint(folder: RunFolder, config: PretrainConfig, total_steps: int) -> LatestCheckpoint | None:
+def frames_digest(source: FrameSource) -> str:
+    """Hash of the frames' tokens in their order."""
+    digest = hashlib.blake2b(digest_size=16)
+    for index in range(len(source)):
+        digest.update(source.token(index).encode() + b"\n")
+    return digest.hexdigest()
+
+
+def latest_checkpoint(
+    folder: RunFolder, config: PretrainConfig, total_steps: int, frames: str
+) -> LatestCheckpoint | None:
     """The checkpoint to continue from, or None if the run was stopped before its first.
 
     Raises:
-        CheckpointError: every checkpoint is damaged, or it belongs to another configuration or length.
+        CheckpointError: every checkpoint is damaged, or it belongs to another configuration, length or other frames.
     """
     latest = load_latest(folder.checkpoints)
     if latest is None:
@@ -379,6 +393,8 @@ def latest_checkpoint(folder: RunFolder, config: PretrainConfig, total_steps: in
             f"{latest.path}: run must have the checkpoint's {latest.state['total_steps']} steps, got {total_steps}: "
             "the number of frames or of processes has changed"
         )
+    if latest.state["frames"] != frames:
+        raise CheckpointError(f"{latest.path}: frames must be those of the checkpoint, in its order, got others")
     return latest
 
 

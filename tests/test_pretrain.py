@@ -7,6 +7,7 @@ import dataclasses
 import json
 import math
 import os
+import pickle
 import random
 import signal
 import subprocess
@@ -273,6 +274,33 @@ def test_resume_with_another_number_of_frames_is_refused(tmp_path: Path, monkeyp
     monkeypatch.setattr(StreetFrames, "__len__", lambda self: 3)
     with pytest.raises(CheckpointError, match="must have the checkpoint's 4 steps, got 6"):
         pretrain(tiny_config(run, steps=None, epochs=2), resume=True)
+
+
+def test_resume_with_other_frames_is_refused(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pred.data.world import StreetFrames
+
+    monkeypatch.setattr(StreetFrames, "token", lambda self, index: f"other-{index}")
+    with pytest.raises(
+        CheckpointError, match=r"step_.*: frames must be those of the checkpoint, in its order, got others"
+    ):
+        pretrain(tiny_config(finished), resume=True)
+
+
+def test_root_and_info_file_may_move(tmp_path: Path) -> None:
+    def config(root: Path, info: Path, frames: list[int]) -> PretrainConfig:
+        info.write_bytes(pickle.dumps([{"token": tree.tokens[frame]} for frame in frames]))
+        found = tiny_config(tmp_path / "run")
+        found.data.dataset, found.data.root, found.data.info = "nuscenes", str(root), str(info)
+        return found
+
+    tree = write_tree(tmp_path / "here")
+    run = pretrain(config(tree.root, tmp_path / "a.pkl", [1, 0]))
+    moved = tree.root.rename(tmp_path / "there")
+    before = (run / "log.csv").read_bytes()
+    pretrain(config(moved, tmp_path / "b.pkl", [1, 0]), resume=True)
+    assert (run / "log.csv").read_bytes() == before
+    with pytest.raises(CheckpointError, match="frames must be those of the checkpoint"):
+        pretrain(config(moved, tmp_path / "b.pkl", [0, 1]), resume=True)
 
 
 def test_resume_without_a_run(tmp_path: Path) -> None:
