@@ -449,6 +449,7 @@ def export_encoder(path: Path, model: Pretrainer, config: PretrainConfig, step: 
             "coordinates": "LiDAR frame of the data set",
             "sweeps": config.data.sweeps,
             "mask_ratio": config.data.mask_ratio,
+            "mask_strategy": config.data.mask_strategy,
             "dataset": config.data.dataset,
             "step": step,
             "seed": config.train.seed,
