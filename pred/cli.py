@@ -136,7 +136,7 @@ def world(arguments: list[str]) -> None:
         help=f"version; {MINI_VERSION} (10 scenes) bears the names of the official scenes and splits",
     )
     parser.add_argument("--sweep-images", action="store_true", help="pictures at the times between keyframes too")
-    parser.add_argument("--exact-labels", action="store_true", help="exact class maps as pseudo labels")
+    parser.add_argument("--exact-labels", action="store_true", help="exact class maps as pseudo labels, and depth maps")
     parser.add_argument("--workers", type=int | None, default=None, help="processes; one per core by default")
     options = parser.parse_args(arguments)
     settings = WorldSettings(

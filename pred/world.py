@@ -5,7 +5,7 @@
 OUT/world.json     the settings; an OUT with others is refused
 OUT/.parts/        one file per finished keyframe, for a run that continues; gone once the tables are there
 OUT/<version>/     the tables; they appear last and all at once
-OUT/samples, sweeps, lidarseg, maps, pseudo: see `pred.data.world.nuscenes_writer`
+OUT/samples, sweeps, lidarseg, maps, pseudo, depth: see `pred.data.world.nuscenes_writer`
 
 Keyframes are made by a pool of processes, each file under a temporary name first. Every file is a function of the
 settings alone, so a run may be killed at any moment and continued with any number of workers.
@@ -143,7 +143,7 @@ def _claim(out: Path, settings: WorldSettings) -> None:
         value = found.get(name) if isinstance(found, dict) else None
         if value != wanted[name]:
             raise WorldFolderError(f"{record}: {name} must be {wanted[name]!r} as asked for, got {value!r}")
-    own = {record.name, ".parts", "samples", "sweeps", "lidarseg", "maps", "pseudo", settings.version}
+    own = {record.name, ".parts", "samples", "sweeps", "lidarseg", "maps", "pseudo", "depth", settings.version}
     if settings.version in held:  # complete: other jobs may add to it
         return
     foreign = [name for name in held if name not in own and not name.endswith(TEMPORARY_SUFFIX)]

@@ -35,6 +35,7 @@ from pred.data.world.nuscenes_writer import (
     WorldSettings,
     _Picture,
     _visible_shares,
+    encode_depth,
     make_token,
 )
 from pred.data.world.sensors import CALIBRATED_MOUNTS, T_EGO_FROM_LIDAR, mounted_camera
@@ -90,7 +91,7 @@ def tree(root: Path) -> dict[str, str]:
 
 def test_files(root: Path) -> None:
     assert {path.name for path in root.iterdir()} == {
-        "world.json", "v1.0-world", "samples", "sweeps", "maps", "lidarseg", "pseudo",
+        "world.json", "v1.0-world", "samples", "sweeps", "maps", "lidarseg", "pseudo", "depth",
     }  # fmt: skip
     keyframes = SCENES * KEYFRAMES
     counts = {
@@ -100,6 +101,7 @@ def test_files(root: Path) -> None:
         "sweeps/CAM_*/*.jpg": 0,
         "lidarseg/v1.0-world/*_lidarseg.bin": keyframes,
         "pseudo/exact/CAM_*/*.png": 6 * keyframes,
+        "depth/exact/CAM_*/*.png": 6 * keyframes,
         "maps/expansion/*.json": 4,
         "maps/*.png": SCENES,
         "v1.0-world/*.json": 15,
@@ -116,6 +118,17 @@ def test_files(root: Path) -> None:
         assert (label.size, label.mode) == ((WIDTH, HEIGHT), "L")
         view = FakeDrive(SEED, 0).view(CALIBRATED_MOUNTS[0], int(first) - 35_000, WIDTH, HEIGHT)
         np.testing.assert_array_equal(np.asarray(label), view.class_id)
+    with Image.open(root / "depth" / "exact" / "CAM_FRONT" / f"{image.stem}.png") as depth:
+        assert (depth.size, depth.mode) == ((WIDTH, HEIGHT), "I;16")
+        np.testing.assert_array_equal(np.asarray(depth), encode_depth(view.depth_m))
+
+
+def test_depth_is_stored_as_in_the_kitti_benchmark() -> None:
+    """256 steps a metre; none for the sky and beyond 255 m."""
+    depth_m = np.array([[1.0, 2.5 / 256, 254.9999, 255.0, 255.01, np.inf]], dtype=np.float32)
+    encoded = encode_depth(depth_m)
+    assert encoded.dtype == np.uint16
+    assert encoded.tolist() == [[256, 2, 65280, 65280, 0, 0]]
 
 
 def test_tables_are_consistent(root: Path) -> None:

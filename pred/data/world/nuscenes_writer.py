@@ -34,6 +34,7 @@ from pred.data.world.town import TownMap
 
 OFFICIAL_IMAGE_SIZE = (1600, 900)
 JPEG_QUALITY = 90
+DEPTH_STEPS_PER_M, DEPTH_MAX_M = 256, 255.0
 MAX_TOWN_M = 400.0
 REGION_M = 475.0
 """Side of the square of map that each scene has to itself. Towns keep 75 m apart: a BEV grid of 100 m x 100 m around a
@@ -114,7 +115,7 @@ class WorldSettings:
         image_scale: size of the images against 1600 x 900; the intrinsics follow.
         version: name of the table folder: ``v1.0-world``, or ``v1.0-mini``, whose ten scenes bear the official names.
         sweep_images: also write pictures at the times of the LiDAR sweeps between keyframes.
-        exact_labels: also write exact class maps as pseudo labels.
+        exact_labels: also write exact class maps as pseudo labels, and exact depth maps.
 
     Raises:
         ValueError: a value is out of range.
@@ -238,7 +239,9 @@ def write_keyframe(root: Path, settings: WorldSettings, drive: Drive, scene: int
             if time_us != keyframe_us:
                 continue
             if settings.exact_labels:
-                files.write_image(f"pseudo/exact/{mount.name}/{Path(path).stem}.png", view.class_id, format="PNG")
+                name = f"exact/{mount.name}/{Path(path).stem}.png"
+                files.write_image(f"pseudo/{name}", view.class_id, format="PNG")
+                files.write_image(f"depth/{name}", encode_depth(view.depth_m), format="PNG")
             camera = mounted_camera(mount, *settings.image_size)
             T_world_from_lidar = drive.T_world_from_ego(camera_us) @ T_EGO_FROM_LIDAR
             T_camera_from_world = camera.T_camera_from_lidar @ invert_rigid(T_world_from_lidar)
@@ -259,6 +262,11 @@ def write_keyframe(root: Path, settings: WorldSettings, drive: Drive, scene: int
     if keyframe == 0:
         part["town"] = _town_part(drive.town)
     return part
+
+
+def encode_depth(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Depth as the KITTI depth benchmark stores it: 256 steps a metre; 0 for none and for more than `DEPTH_MAX_M`."""
+    return np.rint(np.where(depth_m <= DEPTH_MAX_M, depth_m, 0.0) * DEPTH_STEPS_PER_M).astype(np.uint16)
 
 
 class _Picture(NamedTuple):
@@ -297,7 +305,7 @@ class _Files:
             file.write(content)
         self.num_bytes += len(content)
 
-    def write_image(self, filename: str, image: NDArray[np.uint8], **options: Any) -> None:
+    def write_image(self, filename: str, image: NDArray[np.uint8 | np.uint16], **options: Any) -> None:
         with atomic_write(self._path(filename)) as file:
             Image.fromarray(image).save(file, **options)
             self.num_bytes += file.tell()
