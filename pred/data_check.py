@@ -25,6 +25,7 @@ from rich.console import Console
 from pred.data import folder as own
 from pred.data import nuscenes, once
 from pred.data.frame import FrameError, check_image_header, open_image, rgb_image_size
+from pred.data.index import FrameIndex
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
 from pred.data.tables import read_json
 from pred.progress import Progress, format_duration
@@ -271,37 +272,43 @@ def check_once(
     names = once.sequence_names(root)
     for split in sorted((root / "ImageSets").glob("*.txt")):
         report.attempt(partial(_check_once_split, split, set(names)))
-    sequences: list[once.OnceSequence] = []
-    for name in names:
-        report.attempt(lambda name=name: sequences.append(once.read_sequence(root / "data" / name)))  # type: ignore[misc]
-    frames = sum(len(sequence.frame_ids) for sequence in sequences)
-    images = sum(len(sequence.frame_ids) * len(sequence.calibrations) for sequence in sequences)
-    annotations = [annotation for sequence in sequences for annotation in sequence.annotations.values()]
+    index = once.build_index(root, report.add)
+    images, poses = index.images, index.sweeps.pose
     report.counts = {
         "sequences": len(names),
-        "frames": frames,
-        "annotated frames": len(annotations),
-        "images": images,
-        "boxes": sum(len(annotation.names) for annotation in annotations),
+        "frames": len(index),
+        "annotated frames": int(np.count_nonzero(index.boxes.annotated)),
+        "images": len(images.path),
+        "boxes": len(index.boxes.name),
     }
-    without_pose = sum(int(np.count_nonzero(np.isnan(sequence.poses[:, 0]))) for sequence in sequences)
+    without_pose = int(np.count_nonzero(poses < 0))
     if without_pose:
         report.note(f"{without_pose:,} frames have no pose; they are placed at the origin")
+    # Images of one camera of one sequence are as far apart as its frames have cameras.
+    cameras_of_frame = np.diff(images.offsets)
+    used, first, count = np.unique(images.calibration, return_index=True, return_counts=True)
+    lenses = [
+        (int(calibration), range(start, start + step * number, step))
+        for calibration, start, number in zip(used, first.tolist(), count.tolist(), strict=True)
+        if any(index.calibrations.distortion[calibration].as_py())
+        for step in [cameras_of_frame[once.frame_of(images, start)]]
+    ]
 
     def checks() -> Iterator[Check]:
-        for sequence in sequences:
-            for frame_id in sequence.frame_ids.tolist():
-                scan = sequence.folder / once.LIDAR / f"{frame_id}.bin"
-                yield partial(once.check_scan_size, scan) if fast else partial(_read, once.read_scan, scan)
-                for camera in sequence.calibrations:
-                    image = sequence.folder / camera / f"{frame_id}.jpg"
-                    yield partial(_check_image, image, None, label_files is not None, fast, report)
-                    if label_files is not None:
-                        folder = label_files / sequence.folder.name / camera
-                        yield partial(_check_once_label, image, folder, fast)
+        for calibration, rows in lenses:
+            yield partial(_check_lens, root, index, calibration, rows)
+        for frame in range(len(index)):
+            scan = root / str(index.sweeps.path[frame])
+            yield partial(once.check_scan_size, scan) if fast else partial(_read, once.read_scan, scan)
+            for row in range(*images.offsets[frame : frame + 2]):
+                image = root / str(images.path[row])
+                yield partial(_check_image, image, None, label_files is not None, fast, report)
+                if label_files is not None:
+                    folder = label_files / image.relative_to(root / "data").parent
+                    yield partial(_check_once_label, image, folder, fast)
 
     files_per_image = 1 if label_files is None else 2
-    return frames + files_per_image * images, checks()
+    return len(lenses) + len(index) + files_per_image * len(images.path), checks()
 
 
 LAYOUTS: dict[str, Callable[[Path, str | None, str | None, bool, Report], tuple[int, Iterator[Check]]]] = {
@@ -344,6 +351,17 @@ def _check_label(folder: Path, stem: str, width: int, height: int, fast: bool) -
         PseudoLabel(file, width, height).class_map()
     elif file.stat().st_size == 0:
         raise FrameError(file, "label must be a readable file, got an empty one")
+
+
+def _check_lens(root: Path, index: FrameIndex, calibration: int, images: range) -> None:
+    """Whether the distortion of one camera of one sequence can be undone; ``images`` are rows of its images."""
+    for row in images:
+        try:
+            width, height = rgb_image_size(root / str(index.images.path[row]))
+        except FrameError:
+            continue  # which the image's own check says
+        once.pinhole_intrinsics(root, index, calibration, width, height)
+        return
 
 
 def _check_once_label(image: Path, folder: Path, fast: bool) -> None:
