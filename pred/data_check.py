@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import time
+from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -18,8 +19,10 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
 from pred.data import folder as own
@@ -27,7 +30,7 @@ from pred.data import nuscenes, once
 from pred.data.frame import FrameError, check_image_header, open_image, rgb_image_size
 from pred.data.index import FrameIndex
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
-from pred.data.tables import read_json
+from pred.data.tables import Row, read_json, read_table, reading_progress
 from pred.progress import Progress, format_duration
 
 MAX_EXAMPLES = 3
@@ -189,6 +192,7 @@ def check_nuscenes(
         if not (tables / f"{name}.json").is_file():
             report.note(f"{tables / name}.json is missing: only the official devkit needs it")
     index = nuscenes.build_index(tables, report.add)
+    _check_readings(tables, report)
     sweeps, images = index.sweeps, index.images
     label_files = _label_folder(root, labels, report)
     scenes = set(index.recording.to_pylist())
@@ -225,6 +229,53 @@ def check_nuscenes(
 
     files_per_image = 1 if label_files is None else 2
     return len(sweeps.path) + files_per_image * len(images.path), checks()
+
+
+def _check_readings(tables: Path, report: Report) -> None:
+    """Rows of sample_data among each other: tokens, prev and next, keyframes. What is wrong with a row by itself
+    was reported before; such rows are left out."""
+    path = tables / "sample_data.json"
+
+    def read(name: str, read_row: Callable[[Row], Any]) -> dict[str, str]:
+        return dict(read_table(tables / f"{name}.json", read_row, report=lambda problem: None))
+
+    channels = read("sensor", lambda row: (row["token"], row["channel"]))
+    channel_of = read("calibrated_sensor", lambda row: (row["token"], channels[row["sensor_token"]]))
+    scene_of = read("sample", lambda row: (row["token"], row["scene_token"]))
+    numbers = array("q")  # five for each row: hashes, since the texts of millions of rows take gigabytes
+
+    def read_row(row: Row) -> None:
+        sample, channel = row["sample_token"], channel_of[row["calibrated_sensor_token"]]
+        links = [hash(row[key]) if row[key] else 0 for key in ("token", "prev", "next")]
+        keyframe = hash((sample, channel)) if row["is_key_frame"] else 0
+        numbers.extend((*links, hash((scene_of[sample], channel)), keyframe))
+
+    with reading_progress("checking sample_data", [path]) as advance:
+        read_table(path, read_row, lambda problem: None, advance)
+    columns = np.frombuffer(numbers, dtype=np.int64).reshape(-1, 5).T
+    token, chain, keyframe = columns[0], columns[3], columns[4]
+
+    def add(rows: NDArray[np.int64], what: str, others: NDArray[np.int64] | None = None) -> None:
+        for number, row in enumerate(rows.tolist()):
+            got = "no such row" if others is None else f"row {others[number] + 1}"
+            report.add(FrameError(path, f"row {row + 1} {what}, got {got}"))
+
+    for values, what in (
+        (token, "must have a token of its own"),
+        (keyframe, "must be the only keyframe of its sample and channel"),
+    ):
+        order = np.argsort(values, kind="stable")
+        again = np.flatnonzero((np.diff(values[order]) == 0) & (values[order][1:] != 0))
+        add(order[again + 1], what, order[again])
+    order = np.argsort(token, kind="stable")
+    for key, link in (("prev", columns[1]), ("next", columns[2])):
+        named = np.flatnonzero(link)
+        place = np.minimum(np.searchsorted(token[order], link[named]), len(token) - 1)
+        found = order[place]
+        there = token[found] == link[named]
+        add(named[~there], f"must name a {key} that is in the table")
+        strange = there & (chain[found] != chain[named])
+        add(named[strange], f"must have its {key} in its own scene and channel", found[strange])
 
 
 def check_folder(
