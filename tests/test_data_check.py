@@ -61,7 +61,7 @@ def damage_everything(tree: Tree) -> dict[Path, str]:
     (tree.tables / "splits.json").write_text('{"first": ["scene-x"]}')
     return {
         tree.keyframe_files[0]: "points must be finite",
-        tree.sweep_files[0]: "sweep must hold whole points",
+        tree.sweep_files[0]: "sweep file must hold whole points",
         tree.sweep_files[1]: "sweep file must exist",
         image: "image file must be readable",
         tree.images[1]["CAM_BACK"]: "image file must be readable",

@@ -45,11 +45,12 @@ from pred.data.index import (
 )
 from pred.data.info_files import load_info
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
-from pred.data.sweeps import Sweep, accumulate, require_finite_points
+from pred.data.sweeps import Sweep, accumulate, check_points_size, read_points, require_finite_points
 from pred.data.tables import Report, Row, raise_problem, read_json, read_table, reading_progress
 
 LIDAR_CHANNEL = "LIDAR_TOP"
-BYTES_PER_POINT = 20  # float32 x, y, z, intensity, ring
+SWEEP_COLUMNS = ("x", "y", "z", "intensity", "ring")
+MISSING_SWEEP_HINT = " (without sweeps/: data.sweeps 1)"
 MICROSECONDS = 1e-6
 
 TABLES = (
@@ -454,37 +455,14 @@ def no_keyframe(tables: Path, token: str) -> FrameError:
 
 def read_sweep(path: Path) -> NDArray[np.float32]:
     """[N, 5] float32: x, y, z, intensity, ring."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise _unreadable_sweep(path, error) from None
-    _require_whole_points(path, len(content))
-    points = np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(-1, 5)
+    points = read_points(path, SWEEP_COLUMNS, "sweep file", MISSING_SWEEP_HINT).astype(np.float32)
     require_finite_points(path, points)
     return points
 
 
 def check_sweep_size(path: Path) -> None:
     """Check the size of a sweep file without reading it; raises as `read_sweep`."""
-    try:
-        _require_whole_points(path, path.stat().st_size)
-    except OSError as error:
-        raise _unreadable_sweep(path, error) from None
-
-
-def _require_whole_points(path: Path, num_bytes: int) -> None:
-    if num_bytes == 0 or num_bytes % BYTES_PER_POINT:
-        raise FrameError(
-            path,
-            f"sweep must hold whole points of {BYTES_PER_POINT} bytes (float32 x, y, z, intensity, "
-            f"ring), got {num_bytes} bytes: truncated?",
-        )
-
-
-def _unreadable_sweep(path: Path, error: OSError) -> FrameError:
-    if isinstance(error, FileNotFoundError):
-        return FrameError(path, "sweep file must exist, got no such file (without sweeps/: data.sweeps 1)")
-    return FrameError(path, f"sweep file must be readable, got {error}")
+    check_points_size(path, SWEEP_COLUMNS, "sweep file", MISSING_SWEEP_HINT)
 
 
 def _add_row(rows: dict[str, int], token: Any) -> None:

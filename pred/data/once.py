@@ -50,7 +50,7 @@ from pred.data.index import (
     strings,
 )
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
-from pred.data.sweeps import place_sweep, require_finite_points
+from pred.data.sweeps import check_points_size, place_sweep, read_points, require_finite_points
 from pred.data.tables import Report, raise_problem, read_json, reading_progress
 from pred.data.undistort import COEFFICIENT_COUNTS, undistort_image, undistorted_intrinsics
 
@@ -58,7 +58,7 @@ CAMERAS = ("cam01", "cam03", "cam05", "cam06", "cam07", "cam08", "cam09")
 """Front, front (other lens), left back, left front, right front, right back, back."""
 CLASSES = ("Car", "Truck", "Bus", "Pedestrian", "Cyclist")
 LIDAR = "lidar_roof"
-BYTES_PER_POINT = 16  # float32 x, y, z, intensity
+SCAN_COLUMNS = ("x", "y", "z", "intensity")
 EGO_BOX = (-1.0, -3.0, 1.0, 2.0)
 """(x_min, y_min, x_max, y_max), metres: nuScenes's box for the own car, in these axes."""
 PIXEL_CENTRE = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
@@ -417,33 +417,14 @@ def read_scan(path: Path) -> NDArray[np.float32]:
     Raises:
         FrameError: the file is missing, unreadable, empty or truncated, or holds NaN or Inf.
     """
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise FrameError(path, "scan must exist, got no such file") from None
-    except OSError as error:
-        raise FrameError(path, f"scan must be readable, got {error}") from None
-    _require_whole_points(path, len(content))
-    points = np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(-1, 4)
+    points = read_points(path, SCAN_COLUMNS).astype(np.float32)
     require_finite_points(path, points)
     return points
 
 
 def check_scan_size(path: Path) -> None:
     """Check the size of a scan without reading it; raises as `read_scan`."""
-    try:
-        _require_whole_points(path, path.stat().st_size)
-    except FileNotFoundError:
-        raise FrameError(path, "scan must exist, got no such file") from None
-
-
-def _require_whole_points(path: Path, num_bytes: int) -> None:
-    if num_bytes == 0 or num_bytes % BYTES_PER_POINT:
-        raise FrameError(
-            path,
-            f"scan must hold whole points of {BYTES_PER_POINT} bytes (float32 x, y, z, intensity), "
-            f"got {num_bytes} bytes: truncated?",
-        )
+    check_points_size(path, SCAN_COLUMNS)
 
 
 def sequence_names(root: Path) -> list[str]:

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pred.data.frame import FrameError
+from pred.data.frame import FrameError, unreadable
 from pred.progress import Progress
 
 PROGRESS_BYTES = 50_000_000
@@ -96,7 +96,7 @@ def read_json(path: Path, what: str = "table") -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise _unreadable(path, error, what) from None
+        raise unreadable(path, error, what) from None
     except (ValueError, RecursionError) as error:
         raise _no_json(path, error, what) from None
 
@@ -111,7 +111,7 @@ def iterate_rows(path: Path, advance: Callable[[int], None] | None = None) -> It
         with open(path, encoding="utf-8") as file:
             yield from _rows(path, file.read, advance)
     except OSError as error:
-        raise _unreadable(path, error) from None
+        raise unreadable(path, error, "table") from None
     except UnicodeDecodeError as error:
         raise _no_json(path, error) from None
 
@@ -178,12 +178,6 @@ def _rows(path: Path, read: Callable[[int], str], advance: Callable[[int], None]
         position += 1
     if peek():
         raise broken("Extra data", dropped + position)
-
-
-def _unreadable(path: Path, error: OSError, what: str = "table") -> FrameError:
-    if isinstance(error, FileNotFoundError):
-        return FrameError(path, f"{what} must exist, got no such file")
-    return FrameError(path, f"{what} must be readable, got {error}")
 
 
 def _reason(error: ValueError | RecursionError) -> str:
