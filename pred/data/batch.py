@@ -450,9 +450,8 @@ def evaluation_batch(
     """Batch of one frame whose rays aim at all held-out returns, each once.
 
     The visible points are a fixed mask of ``seed`` and the frame, of the run's own strategy and ratio: what the encoder
-    was trained to see. Whatever views and filter the run trains with, depth
-    rays are those of the LiDAR view and semantic rays those of the cameras; a return that two cameras see gives two.
-    Jitter is 0.5 (no randomness).
+    was trained to see. Whatever views and filter the run trains with, depth rays are those of the LiDAR view and
+    semantic rays those of the cameras; a return that two cameras see gives two. Jitter is 0.5 (no randomness).
 
     Raises:
         FrameError: a pseudo label cannot be used.
