@@ -33,7 +33,7 @@ import pyarrow.ipc
 from numpy.typing import NDArray
 
 from pred.checkpoint import atomic_write, remove_leftovers
-from pred.data.frame import Frame, FrameError
+from pred.data.frame import Frame, FrameError, pose_matrix
 
 FILE_NAME = "pred_index.arrow"
 FORMAT_VERSION = 2
@@ -319,6 +319,11 @@ def _checksum(path: Path, size: int) -> bytes:
             crc = zlib.crc32(chunk, crc)
             size -= len(chunk)
     return crc.to_bytes(_CHECKSUM_BYTES, "little")
+
+
+def rigid(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[4, 4] matrix of one pose of an index, [7]."""
+    return pose_matrix(pose[:3], pose[3:])
 
 
 def strings(values: Sequence[str]) -> pa.StringArray:

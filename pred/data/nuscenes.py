@@ -25,7 +25,6 @@ from pred.data.frame import (
     FrameError,
     check_image_header,
     invert_rigid,
-    pose_matrix,
     require_inside,
     require_intrinsics,
     transform_points,
@@ -42,6 +41,7 @@ from pred.data.index import (
     number_lists,
     offsets_of,
     open_index,
+    rigid,
     strings,
 )
 from pred.data.info_files import load_info
@@ -174,8 +174,8 @@ class NuScenesFrames(IndexedFrames):
 
     def _sensor_pose(self, readings: Readings, row: int) -> NDArray[np.float64]:
         """T_world_from_sensor at the time of the measurement."""
-        T_world_from_ego = _rigid(self._index.poses[readings.pose[row]])
-        return T_world_from_ego @ _rigid(self._index.calibrations.pose[readings.calibration[row]])
+        T_world_from_ego = rigid(self._index.poses[readings.pose[row]])
+        return T_world_from_ego @ rigid(self._index.calibrations.pose[readings.calibration[row]])
 
     def _sweeps(self, keyframe: int, T_world_from_lidar: NDArray[np.float64]) -> Iterator[Sweep]:
         """The keyframe's own sweep and those before it."""
@@ -222,7 +222,7 @@ class NuScenesFrames(IndexedFrames):
         boxes = self._index.boxes
         rows = slice(*boxes.offsets[row : row + 2].tolist())
         T_lidar_from_world = invert_rigid(T_world_from_lidar)
-        poses = [T_lidar_from_world @ _rigid(pose) for pose in boxes.pose[rows]]
+        poses = [T_lidar_from_world @ rigid(pose) for pose in boxes.pose[rows]]
         T_lidar_from_box = np.stack(poses) if poses else np.zeros((0, 4, 4))
         return Boxes(
             centre_m=T_lidar_from_box[:, :3, 3],
@@ -493,11 +493,6 @@ def _pose(row: Row) -> list[float]:
     if abs(math.hypot(*pose[3:]) - 1.0) > 1e-2:
         raise ValueError(f"rotation {rotation}, which is not a unit quaternion")
     return pose
-
-
-def _rigid(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[4, 4] matrix of a row of poses."""
-    return pose_matrix(pose[:3], pose[3:])
 
 
 def only_table_folder(root: Path) -> Path:

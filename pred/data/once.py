@@ -31,7 +31,6 @@ from pred.data.frame import (
     Frame,
     FrameError,
     invert_rigid,
-    pose_matrix,
     quaternion_of,
     read_rgb,
     require_intrinsics,
@@ -47,6 +46,7 @@ from pred.data.index import (
     number_lists,
     offsets_of,
     open_index,
+    rigid,
     strings,
 )
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
@@ -167,7 +167,7 @@ class OnceFrames(IndexedFrames):
             point_index=point_index,
             is_keyframe=np.ones(len(points), dtype=np.bool_),
             cameras=[camera for camera in cameras if camera is not None],
-            T_world_from_lidar=_rigid(self._index.poses[pose]) if pose >= 0 else np.eye(4),
+            T_world_from_lidar=rigid(self._index.poses[pose]) if pose >= 0 else np.eye(4),
             source=str(scan),
             boxes=_boxes(self.annotation(index)),
         )
@@ -197,7 +197,7 @@ class OnceFrames(IndexedFrames):
         camera = Camera(
             name=name,
             intrinsics=intrinsics + PIXEL_CENTRE,
-            T_camera_from_lidar=invert_rigid(_rigid(calibrations.pose[calibration])),
+            T_camera_from_lidar=invert_rigid(rigid(calibrations.pose[calibration])),
             width=width,
             height=height,
             image=path,
@@ -254,11 +254,6 @@ def _boxes(annotation: tuple[list[str], NDArray[np.float64]] | None) -> Boxes | 
     names, boxes = annotation
     yaw_rad = np.arctan2(np.sin(boxes[:, 6]), np.cos(boxes[:, 6]))
     return Boxes(centre_m=boxes[:, :3], size_m=boxes[:, 3:6], yaw_rad=yaw_rad, names=names)
-
-
-def _rigid(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[4, 4] matrix of a row of poses."""
-    return pose_matrix(pose[:3], pose[3:])
 
 
 # The index
