@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What pre-training on a made world learns: rendering against projected labels, trained against untrained encoders.
 
-``python -m benchmarks.world_study ROOT --out FOLDER`` pre-trains `world_pillars` on the ``train`` split of a world (made
-with ``--exact-labels``) once per variant and seed, measures each run on the ``val`` split by ``pred evaluate rendering`` and
-``pred evaluate probe``, prints tables in Markdown and writes them with every figure as JSON. All variants have the same
-network, rays, steps and data; they differ in the options below. What is finished in FOLDER is not done again.
+``python -m benchmarks.world_study ROOT --out FOLDER`` trains `world_pillars` on the ``train`` split of a world (made
+with ``--exact-labels``) once per variant and seed, measures it on the ``val`` split by ``pred evaluate rendering``
+and ``pred evaluate probe``, prints tables in Markdown, and writes them with every figure as JSON. All variants have the
+same network, rays, steps and data; they differ in the options below. What is finished in FOLDER is not done again.
 """
 
 from __future__ import annotations
