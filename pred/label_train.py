@@ -49,8 +49,8 @@ WEIGHTS_FILE = "model.safetensors"
 
 @dataclass
 class LabelTrainConfig:
-    """What a segmenter is trained on, its sizes and its training. The defaults are for 20 minutes on two cores and images
-    of 400 x 225 pixels."""
+    """What a segmenter is trained on, its sizes and its training. The defaults are for 20 minutes on two cores and
+    images of 400 x 225 pixels."""
 
     out: str = "runs/segmenter"
     """New folder, or one in which the same command was interrupted."""
@@ -105,7 +105,9 @@ class LabelTrainConfig:
         if self.batch_size < 2:
             raise ValueError(f"batch_size must be at least 2, for the batch normalisation, got {self.batch_size}")
         if self.checkpoint_every < 1 or (self.steps is not None and self.steps < 1):
-            raise ValueError(f"steps and checkpoint_every must be at least 1, got {self.steps}, {self.checkpoint_every}")
+            raise ValueError(
+                f"steps and checkpoint_every must be at least 1, got {self.steps}, {self.checkpoint_every}"
+            )
 
 
 class Example(NamedTuple):
@@ -157,7 +159,9 @@ def train_segmenter(config: LabelTrainConfig) -> Path:
         return elapsed_s / (60 * config.minutes) if config.steps is None else step / config.steps
 
     resumed = f" from step {step}" if step else ""
-    print(f"{out}: {len(train_frames)} frames{resumed}, network input {segmenter.size}, {torch.get_num_threads()} threads")
+    print(
+        f"{out}: {len(train_frames)} frames{resumed}, network input {segmenter.size}, {torch.get_num_threads()} threads"
+    )
     total = config.steps or round(60 * config.minutes)
     start_time = time.monotonic()
     with Progress("step" if config.steps else "second", total, step if config.steps else int(elapsed_s)) as progress:
@@ -178,7 +182,9 @@ def train_segmenter(config: LabelTrainConfig) -> Path:
             step += 1
             now = time.monotonic()
             elapsed_s, start_time = elapsed_s + now - start_time, now
-            progress.update(min(step if config.steps else int(elapsed_s), total), f"step {step}  loss {loss.item():.3f}")
+            progress.update(
+                min(step if config.steps else int(elapsed_s), total), f"step {step}  loss {loss.item():.3f}"
+            )
             if step % config.checkpoint_every == 0:
                 state = {"model": model.state_dict(), "optimizer": optimizer.state_dict(), "elapsed_s": elapsed_s}
                 save_checkpoint(checkpoints, step, state, keep_last=2)
@@ -191,7 +197,9 @@ def train_segmenter(config: LabelTrainConfig) -> Path:
     facts = {"steps": step, "training_s": round(elapsed_s, 1), "threads": torch.get_num_threads()}
     write_json(out / "evaluation.json", {**measured, **facts})
     shutil.rmtree(checkpoints, ignore_errors=True)
-    print_table(measured, f"{config.val_split}: {measured['images']} images, {step} steps in {format_duration(elapsed_s)}")
+    print_table(
+        measured, f"{config.val_split}: {measured['images']} images, {step} steps in {format_duration(elapsed_s)}"
+    )
     return out
 
 
@@ -205,7 +213,9 @@ def build_segmenter(config: LabelTrainConfig, image_size: tuple[int, int]) -> Se
             kind = type(segmenter.model).__name__
             raise FrameError(config.init, f"init must be a MobileNetV2ForSemanticSegmentation, got {kind}")
         if segmenter.channels != list(range(NUM_CLASSES)):
-            raise FrameError(config.init, "init must have its classes in the order of Cityscapes' train ids, got another")
+            raise FrameError(
+                config.init, "init must have its classes in the order of Cityscapes' train ids, got another"
+            )
         model = segmenter.model
     else:
         architecture = transformers.MobileNetV2Config(
@@ -248,7 +258,9 @@ class LabelledImages:
         """
         found = [camera for camera in self.source.load(index).cameras if camera.labels is not None]
         if not found:
-            raise FrameError(self.where, f"frames must have labels (data.labels), got none for {self.source.token(index)}")
+            raise FrameError(
+                self.where, f"frames must have labels (data.labels), got none for {self.source.token(index)}"
+            )
         return found
 
     def draw(self, rng: np.random.Generator) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -121,7 +121,11 @@ def claim_settings(path: Path, wanted: Mapping[str, Any]) -> None:
     """
     folder = path.parent
     if not path.is_file():
-        held = [file.name for file in folder.iterdir() if not file.name.endswith(TEMPORARY_SUFFIX)] if folder.is_dir() else []
+        held = (
+            [file.name for file in folder.iterdir() if not file.name.endswith(TEMPORARY_SUFFIX)]
+            if folder.is_dir()
+            else []
+        )
         if folder.exists() and (held or not folder.is_dir()):
             raise RunFolderError(f"{folder}: must be a new folder, got one that holds {(held or ['a file'])[0]}")
         folder.mkdir(parents=True, exist_ok=True)

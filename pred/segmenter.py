@@ -152,15 +152,16 @@ def load_segmenter(name: str, size: tuple[int, int] | None = None) -> Segmenter:
     absent = sorted({*report["missing_keys"], *mismatched})
     if absent:
         raise FrameError(
-            name, f"model must hold all its weights, got none (or of another shape) for {len(absent)} such as {absent[0]}"
+            name,
+            f"model must hold all its weights, got none (or of another shape) for {len(absent)} such as {absent[0]}",
         )
     model.eval().requires_grad_(False)
     return Segmenter(model, processor, channels, size)
 
 
 _NO_PREPROCESSOR = (
-    "model must come with its preprocessor configuration, got none: input scaled otherwise than in training gives wrong "
-    "labels without any error"
+    "model must come with its preprocessor configuration, got none: input scaled otherwise than in training "
+    "gives wrong labels without any error"
 )
 
 
