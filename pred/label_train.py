@@ -64,7 +64,7 @@ class LabelTrainConfig:
     """Checkpoint folder to start from (such as an earlier OUT); None: random weights."""
     width: float = 0.5
     """Width multiplier of the network."""
-    output_stride: int = 8
+    output_stride: int = 16
     """Input pixels per output cell: 8 or 16."""
     scale: float = 1.6
     """Images are resized by this factor for the network."""
@@ -80,7 +80,7 @@ class LabelTrainConfig:
     """Optimiser steps; None: as many as fit into `minutes`."""
     batch_size: int = 8
     """Crops per step."""
-    lr: float = 2e-3
+    lr: float = 3e-3
     """Largest learning rate; it rises linearly, then falls as half a cosine."""
     weight_decay: float = 0.01
     """Decoupled weight decay."""
@@ -138,7 +138,7 @@ def train_segmenter(config: LabelTrainConfig) -> Path:
 
     segmenter = build_segmenter(config, train_frames.image_size)
     model = segmenter.model
-    # Its output is not used for segmentation, and it costs a third of the time.
+    # Its output is not used for segmentation, and it costs time.
     spare, model.mobilenet_v2.conv_1x1 = model.mobilenet_v2.conv_1x1, torch.nn.Identity()
     model.to(memory_format=torch.channels_last).requires_grad_(True).train()
     for layer in model.modules():

@@ -123,12 +123,13 @@ def load_segmenter(name: str, size: tuple[int, int] | None = None) -> Segmenter:
         if not (folder / PREPROCESSOR_FILE).is_file():
             raise FrameError(folder / PREPROCESSOR_FILE, _NO_PREPROCESSOR)
     elif folder.exists() or not re.fullmatch(r"[\w.-]+(/[\w.-]+)?", name) or name.startswith("."):
-        raise FrameError(name, "model must be a folder or an id of the Hugging Face hub, got no such folder")
+        raise FrameError(name, "model must be a folder or an id of the Hugging Face hub, got neither")
     # Damaged and missing files surface as OSError, ValueError, KeyError, RuntimeError, SafetensorError, ...
     try:
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False)
     except Exception as error:
-        raise FrameError(name, f"model must have a readable config.json, got {_first_line(error)}") from None
+        what = "have a readable config.json" if folder.is_dir() else "be a folder or an id of the Hugging Face hub"
+        raise FrameError(name, f"model must {what}, got {_first_line(error)}") from None
     channels = cityscapes_channels(name, config.id2label)
     try:
         processor = transformers.AutoImageProcessor.from_pretrained(name, trust_remote_code=False, backend="pil")
