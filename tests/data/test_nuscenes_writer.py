@@ -353,6 +353,13 @@ def test_cameras_see_the_points(devkit: Any) -> None:
     assert hits >= (sweep.instance == 2).sum()
 
 
+def test_intersections(root: Path) -> None:
+    """The first of each town's two road segments."""
+    for location in list(LOCATIONS)[:SCENES]:
+        expansion = json.loads((root / "maps" / "expansion" / f"{location}.json").read_text())
+        assert [row["is_intersection"] for row in expansion["road_segment"]] == [True, False]
+
+
 def test_maps(root: Path, devkit: Any) -> None:
     map_api = pytest.importorskip("nuscenes.map_expansion.map_api")
     for location in LOCATIONS:
@@ -373,7 +380,7 @@ def test_maps(root: Path, devkit: Any) -> None:
         town = map_api.NuScenesMap(str(root), log["location"])
         layers = {
             "drivable_area": 120 * 120 + 60 * 20,
-            "road_segment": 60 * 20,
+            "road_segment": 20 * 20 + 60 * 20,
             "road_block": 60 * 10,
             "lane": 60 * 10,
             "ped_crossing": 4 * 20,

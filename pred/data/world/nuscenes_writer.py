@@ -26,6 +26,7 @@ from PIL import Image, ImageDraw
 
 from pred.checkpoint import atomic_write, sync_folder, write_text
 from pred.data.frame import MIN_PROJECTION_DEPTH_M, Camera, invert_rigid, quaternion_of, transform_points
+from pred.data.image_depth import VALUES_PER_M
 from pred.data.nuscenes import LIDAR_CHANNEL
 from pred.data.world.actors import Actor
 from pred.data.world.annotation import annotated_keyframes, candidates
@@ -35,7 +36,7 @@ from pred.data.world.town import TownMap
 
 OFFICIAL_IMAGE_SIZES = {"nuscenes": (1600, 900), "once": (1920, 1020)}
 JPEG_QUALITY = 90
-DEPTH_STEPS_PER_M, DEPTH_MAX_M = 256, 255.0
+DEPTH_MAX_M = 255.0
 MAX_TOWN_M = 400.0
 REGION_M = 475.0
 """Side of the square of map that each scene has to itself. Towns keep 75 m apart: a BEV grid of 100 m x 100 m around a
@@ -78,7 +79,7 @@ LOCATIONS = {
 
 POLYGON_LAYERS: dict[str, Row] = {
     "drivable_area": {},
-    "road_segment": {"is_intersection": False, "drivable_area_token": ""},
+    "road_segment": {"drivable_area_token": ""},
     "road_block": {"from_edge_line_token": "", "to_edge_line_token": "", "road_segment_token": ""},
     "lane": {
         "lane_type": "CAR",
@@ -273,7 +274,7 @@ def write_keyframe(root: Path, settings: WorldSettings, drive: Drive, scene: int
 
 def encode_depth(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     """Depth as the KITTI depth benchmark stores it: 256 steps a metre; 0 for none and for more than `DEPTH_MAX_M`."""
-    return np.rint(np.where(depth_m <= DEPTH_MAX_M, depth_m, 0.0) * DEPTH_STEPS_PER_M).astype(np.uint16)
+    return np.rint(np.where(depth_m <= DEPTH_MAX_M, depth_m, 0.0) * VALUES_PER_M).astype(np.uint16)
 
 
 class _Picture(NamedTuple):
@@ -387,6 +388,11 @@ def _hidden_pixels(picture: _Picture, actor: Actor) -> int:
 def _town_part(town: TownMap) -> Row:
     part = {
         "polygons": {layer: [polygon.tolist() for polygon in town.polygons.get(layer, [])] for layer in POLYGON_LAYERS},
+        "intersections": [
+            number
+            for number, segment in enumerate(town.polygons["road_segment"])
+            if any(np.array_equal(segment, intersection) for intersection in town.intersections)
+        ],
         "lines": {layer: [line.tolist() for line in town.lines.get(layer, [])] for layer in LINE_LAYERS},
     }
     low, high = _extent(part)
@@ -397,7 +403,7 @@ def _town_part(town: TownMap) -> Row:
 
 def _extent(town: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """South-west and north-east corner [2] of a town's map."""
-    shapes = [shape for kind in town.values() for layer in kind.values() for shape in layer]
+    shapes = [shape for kind in ("polygons", "lines") for layer in town[kind].values() for shape in layer]
     points = np.concatenate([np.asarray(shape, dtype=np.float64) for shape in shapes] or [np.zeros((1, 2))])
     return points.min(axis=0), points.max(axis=0)
 
@@ -629,7 +635,10 @@ class _Map:
                 nodes = self._add_nodes(polygon, np.asarray(shape) + offset[:2])
                 self.expansion["polygon"].append({"token": polygon, "exterior_node_tokens": nodes, "holes": []})
                 geometry = {"polygon_tokens": [polygon]} if layer == "drivable_area" else {"polygon_token": polygon}
-                self.expansion[layer].append({"token": make_token(token, layer, number), **geometry, **open_fields})
+                row = {"token": make_token(token, layer, number), **geometry, **open_fields}
+                if layer == "road_segment":
+                    row["is_intersection"] = number in town["intersections"]
+                self.expansion[layer].append(row)
         for layer, open_fields in LINE_LAYERS.items():
             for number, shape in enumerate(town["lines"][layer]):
                 line = make_token(token, layer, number, "line")
