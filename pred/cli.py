@@ -120,14 +120,15 @@ def world(arguments: list[str]) -> None:
     from pred.world import make_world
 
     parser = ConfigParser(
-        prog="pred world", description="Make a data set of procedural towns in the official nuScenes layout."
+        prog="pred world", description="Make a data set of procedural towns in the official nuScenes or ONCE layout."
     )
     parser.add_argument("what", choices=["make"], help="make: write a world, or continue one that was interrupted")
     parser.add_argument("out", metavar="OUT", help="new folder, or one in which the same command was interrupted")
     parser.add_argument("--scenes", type=int, required=True, help="number of drives, each through a town of its own")
     parser.add_argument("--seed", type=int, default=0, help="draws towns, drives and noise")
     parser.add_argument("--keyframes", type=int, default=40, help="keyframes per scene, 2 a second")
-    parser.add_argument("--image-scale", type=float, default=0.25, help="size of the images against 1600 x 900")
+    parser.add_argument("--image-scale", type=float, default=0.25, help="size of the images against the official one")
+    parser.add_argument("--layout", choices=["nuscenes", "once"], default="nuscenes", help="official layout of OUT")
     parser.add_argument(
         "--as",
         dest="version",
@@ -144,6 +145,7 @@ def world(arguments: list[str]) -> None:
         seed=options.seed,
         keyframes=options.keyframes,
         image_scale=options.image_scale,
+        layout=options.layout,
         version=options.version,
         sweep_images=options.sweep_images,
         exact_labels=options.exact_labels,
@@ -217,7 +219,7 @@ COMMANDS = {
     "pretrain": Command(pretrain, "pre-train a LiDAR encoder; --resume RUN continues"),
     "evaluate": Command(evaluate, "evaluate rendering RUN: errors on held-out returns; once FILE: AP of 3D boxes"),
     "view": Command(view, "view RUN: pictures of what the run renders"),
-    "world": Command(world, "make OUT: a data set of procedural towns in the nuScenes layout"),
+    "world": Command(world, "make OUT: a data set of procedural towns in the nuScenes or ONCE layout"),
     "label": Command(label, "pseudo labels of images by a segmentation network; label train makes one"),
     "data": Command(data, "data check ROOT: what is missing or broken in a data set"),
     "doctor": Command(doctor, "versions, backend, machine, and what is missing"),
