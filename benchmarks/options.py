@@ -120,10 +120,10 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument(
         "--capture-from",
-        default="demo",
+        default="runs/demo/config.yaml",
         metavar="CONFIG",
         help="with --capture: a configuration of pred pretrain, by name or as a YAML file, of which two steps are run; "
-        "or step, the rendering step at --sizes (default: demo)",
+        "or step, the rendering step at --sizes (default: runs/demo/config.yaml, the run of make demo)",
     )
 
     options = parser.parse_args(arguments)

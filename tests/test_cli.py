@@ -193,8 +193,8 @@ def test_rule_between_fields_is_an_error_in_one_line(capfd: pytest.CaptureFixtur
 
 
 def test_street_labels_are_auto_or_none(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert parse("--config=demo", "--data.labels=none").data.labels == "none"
-    options = ["--config", "demo", "--data.labels", "pseudo/x", "--run", str(tmp_path / "run")]
+    assert parse("--config=demo", "--data.dataset=street", "--data.labels=none").data.labels == "none"
+    options = ["--config=demo", "--data.dataset=street", "--data.labels=pseudo/x", "--run", str(tmp_path / "run")]
     assert cli.main(["pretrain", *options]) == 1
     assert "data.labels must be auto or none for the street, got 'pseudo/x'" in capfd.readouterr().err
 

@@ -44,7 +44,7 @@ def check(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_step_on_the_street(native: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    check(["--config=demo", "--data.street.frames=1", "--data.workers=0"], monkeypatch)
+    check(["--config=demo", "--data.dataset=street", "--data.street.frames=1", "--data.workers=0"], monkeypatch)
 
 
 def test_step_on_the_real_keyframe(native: None, nuscenes_tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
