@@ -153,6 +153,30 @@ def world(arguments: list[str]) -> None:
     make_world(Path(options.out), settings, workers=options.workers)
 
 
+def label(arguments: list[str]) -> None:
+    from pred.config import build, config_parser
+
+    if arguments[:1] == ["train"]:
+        from pred.label_train import LabelTrainConfig, train_segmenter
+
+        parser = config_parser(
+            "pred label train",
+            "Train a segmentation network (DeepLabV3 + MobileNetV2) on class maps.",
+            LabelTrainConfig,
+        )
+        train_segmenter(build(parser, LabelTrainConfig, parser.parse_args(arguments[1:])))
+        return
+    from pred.label import LabelConfig
+    from pred.label import label as run_labelling
+
+    parser = config_parser(
+        "pred label",
+        "Pseudo labels of a segmentation network, at the pixels of LiDAR returns. `pred label train` trains one.",
+        LabelConfig,
+    )
+    run_labelling(build(parser, LabelConfig, parser.parse_args(arguments)))
+
+
 def data(arguments: list[str]) -> None:
     from argparse import ArgumentParser
 
@@ -196,6 +220,7 @@ COMMANDS = {
     "evaluate": Command(evaluate, "evaluate rendering RUN: errors on held-out returns; once FILE: AP of 3D boxes"),
     "view": Command(view, "view RUN: pictures of what the run renders"),
     "world": Command(world, "make OUT: a data set of procedural towns in the nuScenes or ONCE layout"),
+    "label": Command(label, "pseudo labels of images by a segmentation network; label train makes one"),
     "data": Command(data, "data check ROOT: what is missing or broken in a data set"),
     "doctor": Command(doctor, "versions, backend, machine, and what is missing"),
 }

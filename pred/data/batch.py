@@ -191,10 +191,12 @@ class SemanticRays(Rays):
     """Rays from cameras through projected LiDAR returns.
 
     Attributes:
+        range_m: [B, R] float32, distance from the origin to the return.
         target: [B, R, 19] float32 class probabilities of the pseudo label at the pixel.
         confidence: [B, R] float32, the largest of them; 1 for hard labels.
     """
 
+    range_m: Tensor
     target: Tensor
     confidence: Tensor
 
@@ -448,9 +450,8 @@ def evaluation_batch(
     """Batch of one frame whose rays aim at all held-out returns, each once.
 
     The visible points are a fixed mask of ``seed`` and the frame, of the run's own strategy and ratio: what the encoder
-    was trained to see. Whatever views and filter the run trains with, depth
-    rays are those of the LiDAR view and semantic rays those of the cameras; a return that two cameras see gives two.
-    Jitter is 0.5 (no randomness).
+    was trained to see. Whatever views and filter the run trains with, depth rays are those of the LiDAR view and
+    semantic rays those of the cameras; a return that two cameras see gives two. Jitter is 0.5 (no randomness).
 
     Raises:
         FrameError: a pseudo label cannot be used.
@@ -605,6 +606,7 @@ def _collate(
             directions=_stack([rays.directions for rays in semantic], num_semantic_rays, UPWARDS),
             valid=_stack([np.ones(len(rays.class_id), bool) for rays in semantic], num_semantic_rays, 0),
             jitter=_stack([draw.semantic_jitter for draw in draws], num_semantic_rays, 0.0),
+            range_m=_stack([rays.range_m for rays in semantic], num_semantic_rays, 1.0),
             target=_stack([rays.target for rays in semantic], num_semantic_rays, 0.0),
             confidence=_stack([rays.confidence for rays in semantic], num_semantic_rays, 0.0),
         ),
