@@ -1,7 +1,7 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
 #
-#   make demo      set up, pre-train a small model on the embedded street, draw pictures
+#   make demo      set up, make a small world, pre-train a small model on it, draw pictures
 #   make test      set up, run all tests
 #   make sanitize  run the op tests under the address and undefined-behaviour sanitizers
 #   make fuzz      random arguments for every op under the sanitizers, for MINUTES
@@ -16,6 +16,7 @@ PYTHON ?= python3
 TORCH ?= 2.13.0
 VENV ?= .venv
 RUN ?= runs/demo
+WORLD ?= runs/demo_world
 MINUTES ?= 60
 SEED ?= 0
 # What wheel-check runs under: version of torch (or newest), colon, Python. One that is missing is an error.
@@ -50,8 +51,9 @@ $(VENV)/dev.stamp: $(VENV)/native.stamp
 	touch $@
 
 demo: $(VENV)/native.stamp
+	$(BIN)/pred world make $(WORLD) --scenes 4 --keyframes 6 --exact-labels
 	if [ -e $(RUN)/config.yaml ]; then $(BIN)/pred pretrain --resume $(RUN); \
-	else $(BIN)/pred pretrain --config demo --run $(RUN); fi
+	else $(BIN)/pred pretrain --config world_pillars --data.root $(WORLD) --train.steps 2000 --run $(RUN); fi
 	$(BIN)/pred evaluate rendering $(RUN)
 	$(BIN)/pred view $(RUN)
 	@echo "encoder weights: $(RUN)/encoder.pth    pictures: $(RUN)/pictures"
