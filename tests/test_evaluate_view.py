@@ -158,7 +158,7 @@ def test_nothing_to_measure_gives_none_and_no_warning() -> None:
     assert error_summary(np.zeros(0, np.float32)) == {"depth_median_m": None, "depth_mean_m": None}
     result = {
         "frames": 1, "depth_rays": 0, "semantic_rays": 0, "semantic_rays_by_class": {}, "nearest_visible": {},
-        "trained": empty, "untrained": empty,
+        "returns_by_class": {}, "projected_label": {}, "all_returns": False, "trained": empty, "untrained": empty,
     }  # fmt: skip
     assert results_table(result).row_count == 5
 
