@@ -97,7 +97,8 @@ def evaluate_probe(
 ) -> dict[str, Any]:
     """Fit and measure the probe of a run, print a table and write RUN/evaluation_probe.json.
 
-    Memory: the features of ``cells_per_frame`` cells of each frame of ``train_split``, for two networks, in float32.
+    Memory: the features of ``cells_per_frame`` cells of each frame of ``train_split``, for two networks in float32, and
+    for one at a time in float64.
 
     Args:
         config: the run's configuration; its data set must know the classes of points.
@@ -287,9 +288,10 @@ def fit_probe(
     """
     std, mean = torch.std_mean(features, dim=0, correction=0)
     std = torch.where(std > 0, std, 1.0)
-    rows = (features - mean) / std
-    weight = torch.zeros(NUM_MERGED, features.shape[1], device=features.device, requires_grad=True)
-    bias = torch.zeros(NUM_MERGED, device=features.device, requires_grad=True)
+    # In float32 the line search stalls before the tolerance.
+    rows = ((features - mean) / std).double()
+    weight = torch.zeros(NUM_MERGED, rows.shape[1], dtype=rows.dtype, device=rows.device, requires_grad=True)
+    bias = torch.zeros(NUM_MERGED, dtype=rows.dtype, device=rows.device, requires_grad=True)
     optimizer = torch.optim.LBFGS(
         [weight, bias],
         max_iter=MAX_ITERATIONS,
@@ -311,8 +313,8 @@ def fit_probe(
     return Probe(
         mean=mean,
         std=std,
-        weight=weight.detach(),
-        bias=bias.detach(),
+        weight=weight.detach().to(features.dtype),
+        bias=bias.detach().to(features.dtype),
         iterations=int(optimizer.state[weight]["n_iter"]),
         converged=steepest <= GRADIENT_TOLERANCE,
     )
