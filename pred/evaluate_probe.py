@@ -97,8 +97,8 @@ def evaluate_probe(
 ) -> dict[str, Any]:
     """Fit and measure the probe of a run, print a table and write RUN/evaluation_probe.json.
 
-    Memory: the features of ``cells_per_frame`` cells of each frame of ``train_split``, for two networks in float32, and
-    for one at a time in float64.
+    Memory: the features of ``cells_per_frame`` cells of each frame of ``train_split``, at most 24 bytes for each number
+    (two networks in float32, and copies of one at a time).
 
     Args:
         config: the run's configuration; its data set must know the classes of points.

@@ -79,17 +79,17 @@ def test_drawn_cells_are_balanced() -> None:
 
 def test_probe_finds_a_linear_rule_and_no_other() -> None:
     generator = torch.Generator().manual_seed(0)
-    features = torch.randn(4000, 6, generator=generator) * torch.tensor([1.0, 100.0, 0.01, 1.0, 1.0, 0.0]) + 5
+    features = torch.randn(1200, 6, generator=generator) * torch.tensor([1.0, 100.0, 0.01, 1.0, 1.0, 0.0]) + 5
     rule = torch.randn(NUM_MERGED, 3, generator=generator)
     classes = ((features[:, :3] - 5) / torch.tensor([1.0, 100.0, 0.01]) @ rule.T).argmax(dim=1)
-    probe = fit_probe(features[:3000], classes[:3000])
+    probe = fit_probe(features[:800], classes[:800])
     assert probe.converged and probe.iterations > 5
-    assert (probe.predict(features[3000:]) == classes[3000:]).float().mean() > 0.95
+    assert (probe.predict(features[800:]) == classes[800:]).float().mean() > 0.9
     # Of noise it learns what is most frequent, and no more.
-    classes = torch.where(torch.rand(3000, generator=generator) < 0.8, 2, 5)
-    probe = fit_probe(features[:3000], classes)
-    assert (probe.predict(features[3000:]) == 2).all()
-    again = fit_probe(features[:3000], classes)
+    classes = torch.where(torch.rand(800, generator=generator) < 0.8, 2, 5)
+    probe = fit_probe(features[:800], classes)
+    assert (probe.predict(features[800:]) == 2).all()
+    again = fit_probe(features[:800], classes)
     assert torch.equal(probe.weight, again.weight) and torch.equal(probe.bias, again.bias)
 
 
@@ -123,21 +123,23 @@ def run_of(config: PretrainConfig) -> Path:
 
 
 def test_probe_of_a_run(config: PretrainConfig, capfd: pytest.CaptureFixture[str]) -> None:
-    options = ["--train-split", "first", "--val-split", "second", "--cells-per-frame", "64"]
+    options = ["--train-split", "first", "--val-split", "second", "--cells-per-frame", "20"]
     assert cli.main(["evaluate", "probe", str(run_of(config)), *options]) == 0
     output = capfd.readouterr().out
     assert "linear probe" in output and "mIoU" in output and "IoU road (" in output
     result = json.loads((run_of(config) / "evaluation_probe.json").read_text())
     assert (result["train_frames"], result["val_frames"], result["skipped"]) == (2, 2, {})
-    assert sum(result["train_cells_by_class"].values()) == 128
+    assert sum(result["train_cells_by_class"].values()) == 40
     for name in ("trained", "untrained"):
         figures = result[name]
         assert figures["converged"]
         assert figures["miou"] == pytest.approx(np.mean(list(figures["iou_by_class"].values())))
         assert set(figures["iou_by_class"]) == set(result["val_cells_by_class"])
-    again = evaluate_probe(config, run_of(config), train_split="first", val_split="second", cells_per_frame=64)
+    again = evaluate_probe(config, run_of(config), train_split="first", val_split="second", cells_per_frame=20)
     assert again == result
-    some = evaluate_probe(config, run_of(config), train_split="first", val_split="second", max_frames=1)
+    some = evaluate_probe(
+        config, run_of(config), train_split="first", val_split="second", cells_per_frame=20, max_frames=1
+    )
     assert (some["train_frames"], some["val_frames"]) == (1, 1)
 
 

@@ -69,7 +69,7 @@ class SemanticCandidates(NamedTuple):
 
 @dataclass
 class FrameCandidates:
-    """What a frame offers to one purpose, training or evaluation; free of randomness.
+    """What a frame offers to training; free of randomness.
 
     Attributes:
         token: frame token.
@@ -123,12 +123,11 @@ def frame_candidates(
     ego_box: tuple[float, ...],
     holdout_fraction: float,
     depth_view: DepthView = "lidar",
-    held_out: bool = False,
     near_m: float = NEAR_M,
     semantic_view: SemanticView = "camera",
     depth_filter: DepthTolerance | None = None,
 ) -> FrameCandidates:
-    """Split a frame into what the encoder may see and what rays may aim at.
+    """Split a frame into what the encoder may see and what training rays may aim at.
 
     Args:
         frame: the frame.
@@ -136,7 +135,6 @@ def frame_candidates(
         ego_box: (x_min, y_min, x_max, y_max), metres, LiDAR frame; applies to keyframe returns.
         holdout_fraction: share of the keyframe returns kept for evaluation.
         depth_view: where depth rays start.
-        held_out: False: rays for training; True: rays towards the held-out returns.
         near_m: rays are rendered from this distance on, so nearer returns are no targets, metres.
         semantic_view: where semantic rays start. A return that several cameras see gives one ray for each of them in
             which it has a label.
@@ -147,7 +145,7 @@ def frame_candidates(
         FrameError: a pseudo label or a depth map cannot be used.
     """
     use = point_use(frame, point_range, ego_box, holdout_fraction)
-    returns = frame.points[use.held_out if held_out else use.targets, :3].astype(np.float64)
+    returns = frame.points[use.targets, :3].astype(np.float64)
     depth, semantic = ray_candidates(returns, frame.cameras, near_m, depth_view, semantic_view, depth_filter)
     return FrameCandidates(frame.token, frame.points[use.input], depth, semantic)
 
