@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The frame index at the size of nuScenes and of ONCE: ``python -m benchmarks.index_scale FOLDER``.
 
-Writes tables as large as those of nuScenes v1.0-trainval into FOLDER (2 GB of JSON, kept for the next time; no sensor
-files) and measures, each in a process of its own: building the index, opening it, and what forked processes that walk
-over random frames hold for themselves. An index of the size of ONCE (a million frames, seven million images) is made
-from columns instead, since its reading is another matter.
+Writes tables as large as those of nuScenes v1.0-trainval and JSON files as large as those of ONCE (a million frames,
+seven million images) into FOLDER: 3 GB, kept for the next time, without sensor files. Measures, each in a process of
+its own: building the index, opening it, and what loader processes that walk over random frames hold for themselves,
+both forked from one that has the index open ("walk") and started afresh ("spawn").
 """
 
 from __future__ import annotations
@@ -13,32 +13,21 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import pickle
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 
 from benchmarks.measure import machine_record
 from benchmarks.memory import status_bytes
-from pred.data import nuscenes
-from pred.data.index import (
-    FILE_NAME,
-    Calibrations,
-    FrameIndex,
-    Images,
-    IndexedBoxes,
-    Sweeps,
-    number_lists,
-    offsets_of,
-    open_index,
-    strings,
-)
+from pred.data import nuscenes, once
+from pred.data.index import FILE_NAME, IndexedFrames
 from pred.random import numpy_generator
 
 VERSION = "v1.0-trainval"
@@ -58,10 +47,10 @@ INSTANCES_PER_SCENE = 76
 
 WALKED_FRAMES = 2000
 
-ONCE_CAMERAS = ("cam01", "cam03", "cam05", "cam06", "cam07", "cam08", "cam09")
 ONCE_FRAMES_PER_SEQUENCE = 1800
 ONCE_ANNOTATED = 60
-"""Every so many frames has boxes."""
+"""Every so many frames has boxes: some 16,000 in all."""
+ONCE_BOXES = 25
 
 Row = dict[str, Any]
 
@@ -79,14 +68,17 @@ def main() -> None:
         print(json.dumps(MEASUREMENTS[options.measure](options)))
         return
     started = time.strftime("%Y-%m-%dT%H:%M:%S%z")
-    tables = options.folder / VERSION
-    if not (tables / f"{options.samples}.complete").is_file():
-        start_time = time.monotonic()
-        num_rows = write_tables(tables, options.samples)
-        (tables / f"{options.samples}.complete").touch()
-        print(f"wrote tables with {num_rows:,} rows of sample_data in {time.monotonic() - start_time:.0f} s")
-    (tables / FILE_NAME).unlink(missing_ok=True)
-    (options.folder / "once" / FILE_NAME).unlink(missing_ok=True)
+    for folder, size, write in (
+        (options.folder / VERSION, options.samples, write_tables),
+        (options.folder / "once", options.once_frames, write_once_files),
+    ):
+        complete = folder / f"{size}.complete"
+        if not complete.is_file():
+            start_time = time.monotonic()
+            num_rows = write(folder, size)
+            complete.touch()
+            print(f"wrote {num_rows:,} readings to {folder} in {time.monotonic() - start_time:.0f} s", flush=True)
+        (folder / FILE_NAME).unlink(missing_ok=True)
     figures = {}
     for name in MEASUREMENTS:
         figures[name] = in_own_process(name, sys.argv[1:])
@@ -130,65 +122,37 @@ def timed(call: Callable[[], Any], file: Path) -> tuple[Any, dict[str, Any]]:
     return result, figures
 
 
+def nuscenes_frames(options: argparse.Namespace) -> IndexedFrames:
+    return nuscenes.NuScenesFrames(options.folder, VERSION)
+
+
+def once_frames(options: argparse.Namespace) -> IndexedFrames:
+    return once.OnceFrames(options.folder / "once", labels="none")
+
+
 def measure_nuscenes(options: argparse.Namespace) -> dict[str, Any]:
     """Build or, where it is there, open."""
-    call = lambda: nuscenes.NuScenesFrames(options.folder, VERSION)  # noqa: E731
-    frames, figures = timed(call, options.folder / VERSION / FILE_NAME)
+    frames, figures = timed(lambda: nuscenes_frames(options), options.folder / VERSION / FILE_NAME)
     return {"frames": len(frames), **figures}
 
 
-def measure_nuscenes_workers(options: argparse.Namespace) -> dict[str, Any]:
-    frames = nuscenes.NuScenesFrames(options.folder, VERSION)
-    # All of `load` except the files, which are not there.
-    nuscenes.read_sweep = lambda path: np.zeros((1, 5), dtype=np.float32)
-    return measure_workers(options.workers, len(frames), frames.load)
-
-
 def measure_once(options: argparse.Namespace) -> dict[str, Any]:
-    folder = options.folder / "once"
-    folder.mkdir(parents=True, exist_ok=True)
-    build = lambda: once_index(options.once_frames)  # noqa: E731
-    index, figures = timed(lambda: open_index(folder, [], build), folder / FILE_NAME)
-    return {"frames": len(index), "images": len(index.images.path), **figures}
+    frames, figures = timed(lambda: once_frames(options), options.folder / "once" / FILE_NAME)
+    json_mb = sum(path.stat().st_size for path in (options.folder / "once").glob("data/*/*.json")) // 1_000_000
+    return {"frames": len(frames), "images": len(frames._index.images.path), "json_mb": json_mb, **figures}
 
 
-def measure_once_workers(options: argparse.Namespace) -> dict[str, Any]:
-    index = open_index(options.folder / "once", [], lambda: once_index(options.once_frames))
-
-    def load(row: int) -> object:
-        sweep = int(index.sweep[row])
-        images = range(*index.images.offsets[row : row + 2])
-        boxes = slice(*index.boxes.offsets[row : row + 2].tolist())
-        return (
-            str(index.token[row]),
-            str(index.sweeps.path[sweep]),
-            index.poses[index.sweeps.pose[sweep]].sum(),
-            [(str(index.images.path[image]), index.images.width[image]) for image in images],
-            index.boxes.name[boxes].to_pylist(),
-            index.boxes.pose[boxes].sum(),
-        )
-
-    return measure_workers(options.workers, len(index), load)
-
-
-def measure_workers(workers: int, num_frames: int, load: Callable[[int], object]) -> dict[str, Any]:
-    """Memory that only one process has, in forked processes that have each loaded random frames."""
-    context = multiprocessing.get_context("fork")
-    barrier, results = context.Barrier(workers), context.Queue()
-
-    def work(worker: int) -> None:
-        rows = numpy_generator(0, worker).integers(0, num_frames, WALKED_FRAMES)
-        start_time = time.monotonic()
-        for row in rows:
-            load(int(row))
-        seconds = time.monotonic() - start_time
-        barrier.wait()  # all are alive: a page that two of them use is not private
-        rollup = "/proc/self/smaps_rollup"
-        private = {name: status_bytes(f"Private_{name}", rollup) for name in ("Clean", "Dirty")}
-        barrier.wait()
-        results.put((private["Dirty"], private["Clean"], seconds))
-
-    processes = [context.Process(target=work, args=(worker,)) for worker in range(workers)]
+def measure_workers(
+    frames_of: Callable[[argparse.Namespace], IndexedFrames], method: str, options: argparse.Namespace
+) -> dict[str, Any]:
+    """Memory that only one process has, added by opening the index (spawn) and loading random frames."""
+    context: Any = multiprocessing.get_context(method)
+    barrier, results = context.Barrier(options.workers), context.Queue()
+    frames: IndexedFrames | bytes = frames_of(options)
+    if method == "spawn":
+        frames = pickle.dumps(frames)
+    arguments = [(frames, worker, barrier, results) for worker in range(options.workers)]
+    processes = [context.Process(target=walk, args=of_worker) for of_worker in arguments]
     for process in processes:
         process.start()
     figures = [results.get() for _ in processes]
@@ -196,20 +160,50 @@ def measure_workers(workers: int, num_frames: int, load: Callable[[int], object]
         process.join()
     dirty, clean, seconds = (max(column) for column in zip(*figures, strict=True))
     return {
-        "workers": workers,
+        "workers": options.workers,
         "private_dirty_mb": round(dirty / 1e6, 1),
         "private_clean_mb": round(clean / 1e6, 1),
         "us_per_frame": round(seconds / WALKED_FRAMES * 1e6),
     }
 
 
+def walk(given: IndexedFrames | bytes, worker: int, barrier: Any, results: Any) -> None:
+    dirty_before, clean_before = private_bytes()
+    frames = pickle.loads(given) if isinstance(given, bytes) else given
+    load_without_files()
+    rows = numpy_generator(0, worker).integers(0, len(frames), WALKED_FRAMES)
+    start_time = time.monotonic()
+    for row in rows:
+        frames.load(int(row))
+    seconds = time.monotonic() - start_time
+    barrier.wait()  # all are alive: a page that two of them use is not private
+    dirty, clean = private_bytes()
+    barrier.wait()
+    results.put((dirty - dirty_before, clean - clean_before, seconds))
+
+
+def private_bytes() -> tuple[int, int]:
+    dirty, clean = (status_bytes(f"Private_{name}", "/proc/self/smaps_rollup") for name in ("Dirty", "Clean"))
+    return dirty, clean
+
+
+def load_without_files() -> None:
+    """All of `load` except the files, which are not there."""
+    nuscenes.read_sweep = lambda path: np.zeros((1, 5), dtype=np.float32)
+    once.read_scan = lambda path: np.zeros((1, 4), dtype=np.float32)
+    once.rgb_image_size = lambda path: (1920, 1020)
+    Path.is_file = lambda self: True  # type: ignore[method-assign]
+
+
 MEASUREMENTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "nuscenes build": measure_nuscenes,
     "nuscenes open": measure_nuscenes,
-    "nuscenes walk": measure_nuscenes_workers,
+    "nuscenes walk": partial(measure_workers, nuscenes_frames, "fork"),
+    "nuscenes spawn": partial(measure_workers, nuscenes_frames, "spawn"),
     "once build": measure_once,
     "once open": measure_once,
-    "once walk": measure_once_workers,
+    "once walk": partial(measure_workers, once_frames, "fork"),
+    "once spawn": partial(measure_workers, once_frames, "spawn"),
 }
 
 
@@ -357,64 +351,47 @@ def sample_time_us(sample: int) -> int:
     return 1_532_402_927_647_951 + 500_000 * sample
 
 
-# Columns like those of ONCE
+# JSON files like those of ONCE
 
 
-def once_index(num_frames: int) -> FrameIndex:
-    """Frames of sequences with seven images each."""
-    rows = np.arange(num_frames, dtype=np.int32)
-    number = rows // ONCE_FRAMES_PER_SEQUENCE
-    sequence = pc.utf8_lpad(pc.cast(pa.array(number), pa.string()), 6, "0")
-    time_us = 1_616_100_000_000_000 + rows.astype(np.int64) * 500_000
-    frame_id = pc.cast(pa.array(time_us // 1000), pa.string())
-    cameras = len(ONCE_CAMERAS)
-    owner = np.repeat(rows, cameras)
-    camera = np.tile(np.arange(cameras, dtype=np.int32), num_frames)
-    image_file = pc.binary_join_element_wise(frame_id.take(owner), "jpg", ".")
-    image_path = pc.binary_join_element_wise(
-        "data", sequence.take(owner), strings(ONCE_CAMERAS).take(camera), image_file, "/"
-    )
-    sweep_file = pc.binary_join_element_wise(frame_id, "bin", ".")
-    box_frames = rows[::ONCE_ANNOTATED]
-    box_owner = np.repeat(box_frames, 20)
-    boxes = np.tile([1.0, 2.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(box_owner), 1))
-    calibrations = cameras + 1
-    sequences = int(number[-1]) + 1
-    return FrameIndex(
-        calibrations=Calibrations(
-            channel=strings(["lidar_roof", *ONCE_CAMERAS] * sequences),
-            pose=np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (calibrations * sequences, 1)),
-            intrinsics=np.tile(np.eye(3), (calibrations * sequences, 1, 1)),
-            distortion=number_lists([[0.1] * 8] * (calibrations * sequences)),
-        ),
-        poses=np.column_stack([rows * 0.5, rows * 0.1, rows * 0.0, rows * 0.0 + 1.0, *(rows * 0.0,) * 3]),
-        sweeps=Sweeps(
-            path=pc.binary_join_element_wise("data", sequence, "lidar_roof", sweep_file, "/"),
-            time_us=time_us,
-            calibration=number * calibrations,
-            pose=rows,
-            previous=np.where(rows % ONCE_FRAMES_PER_SEQUENCE == 0, -1, rows - 1).astype(np.int32),
-            frame=rows,
-        ),
-        token=pc.binary_join_element_wise(sequence, frame_id, "/"),
-        recording=sequence,
-        sweep=rows,
-        images=Images(
-            path=image_path,
-            time_us=time_us[owner],
-            calibration=number[owner] * calibrations + 1 + camera,
-            pose=owner,
-            width=np.full(len(owner), 1920, dtype=np.int32),
-            height=np.full(len(owner), 1020, dtype=np.int32),
-            offsets=np.arange(0, cameras * num_frames + 1, cameras, dtype=np.int32),
-        ),
-        boxes=IndexedBoxes(
-            name=strings(["Car"] * len(box_owner)),
-            pose=boxes,
-            size_lwh=boxes[:, :3] + 1.0,
-            offsets=offsets_of(box_owner, num_frames),
-        ),
-    )
+def write_once_files(root: Path, num_frames: int) -> int:
+    """The JSON file of each sequence; returns the number of images that they speak of."""
+    for sequence in range(-(-num_frames // ONCE_FRAMES_PER_SEQUENCE)):
+        first = sequence * ONCE_FRAMES_PER_SEQUENCE
+        rows = range(first, min(first + ONCE_FRAMES_PER_SEQUENCE, num_frames))
+        name = f"{sequence:06d}"
+        folder = root / "data" / name
+        folder.mkdir(parents=True, exist_ok=True)
+        content = {
+            "meta_info": {"weather": "sunny", "period": "morning", "image_size": [1920, 1020]},
+            "calib": {camera: once_calibration(sequence) for camera in once.CAMERAS},
+            "frames": [once_frame(name, row) for row in rows],
+        }
+        (folder / f"{name}.json").write_text(json.dumps(content))
+    return num_frames * len(once.CAMERAS)
+
+
+def once_calibration(sequence: int) -> Row:
+    return {
+        "cam_to_velo": [[0.0, 0.0, -1.0, -0.03], [1.0, 0.0, 0.0, 0.11], [0.0, -1.0, 0.0, -0.2], [0.0, 0.0, 0.0, 1.0]],
+        "cam_intrinsic": [[964.3214 + 0.01 * sequence, 0.0, 977.4321], [0.0, 966.1134, 517.4312], [0.0, 0.0, 1.0]],
+        "distortion": [[-0.3199812, 0.1151423, -0.0004217, 0.0011043, -0.0210034]],
+    }
+
+
+def once_frame(sequence: str, row: int) -> Row:
+    turn = np.sin(0.01 * row), np.cos(0.01 * row)
+    # Two of a hundred have no pose.
+    pose = [0.0, 0.0, *turn, 0.4912345678 * row, -1.23456789 * row, 0.0123456789] if row % 50 else [0.0] * 7
+    frame: Row = {"sequence_id": sequence, "frame_id": str(1_616_100_000_000 + 500 * row), "pose": pose}
+    if row % ONCE_ANNOTATED == 0:
+        box = [12.3456789 + row % 7, -23.4567891, -0.7654321, 4.5678912, 1.8765432, 1.5432198, 1.6789123]
+        frame["annos"] = {
+            "names": ["Car"] * ONCE_BOXES,
+            "boxes_3d": [box] * ONCE_BOXES,
+            "boxes_2d": {camera: [[712.3456789, 412.3456789, 801.23, 498.7]] * ONCE_BOXES for camera in once.CAMERAS},
+        }
+    return frame
 
 
 if __name__ == "__main__":

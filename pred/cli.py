@@ -160,14 +160,15 @@ def world(arguments: list[str]) -> None:
     from pred.world import make_world
 
     parser = ConfigParser(
-        prog="pred world", description="Make a data set of procedural towns in the official nuScenes layout."
+        prog="pred world", description="Make a data set of procedural towns in the official nuScenes or ONCE layout."
     )
     parser.add_argument("what", choices=["make"], help="make: write a world, or continue one that was interrupted")
     parser.add_argument("out", metavar="OUT", help="new folder, or one in which the same command was interrupted")
     parser.add_argument("--scenes", type=int, required=True, help="number of drives, each through a town of its own")
     parser.add_argument("--seed", type=int, default=0, help="draws towns, drives and noise")
     parser.add_argument("--keyframes", type=int, default=40, help="keyframes per scene, 2 a second")
-    parser.add_argument("--image-scale", type=float, default=0.25, help="size of the images against 1600 x 900")
+    parser.add_argument("--image-scale", type=float, default=0.25, help="size of the images against the official one")
+    parser.add_argument("--layout", choices=["nuscenes", "once"], default="nuscenes", help="official layout of OUT")
     parser.add_argument(
         "--as",
         dest="version",
@@ -176,7 +177,7 @@ def world(arguments: list[str]) -> None:
         help=f"version; {MINI_VERSION} (10 scenes) bears the names of the official scenes and splits",
     )
     parser.add_argument("--sweep-images", action="store_true", help="pictures at the times between keyframes too")
-    parser.add_argument("--exact-labels", action="store_true", help="exact class maps as pseudo labels")
+    parser.add_argument("--exact-labels", action="store_true", help="exact class maps as pseudo labels, and depth maps")
     parser.add_argument("--workers", type=int | None, default=None, help="processes; one per core by default")
     options = parser.parse_args(arguments)
     settings = WorldSettings(
@@ -184,11 +185,36 @@ def world(arguments: list[str]) -> None:
         seed=options.seed,
         keyframes=options.keyframes,
         image_scale=options.image_scale,
+        layout=options.layout,
         version=options.version,
         sweep_images=options.sweep_images,
         exact_labels=options.exact_labels,
     )
     make_world(Path(options.out), settings, workers=options.workers)
+
+
+def label(arguments: list[str]) -> None:
+    from pred.config import build, config_parser
+
+    if arguments[:1] == ["train"]:
+        from pred.label_train import LabelTrainConfig, train_segmenter
+
+        parser = config_parser(
+            "pred label train",
+            "Train a segmentation network (DeepLabV3 + MobileNetV2) on class maps.",
+            LabelTrainConfig,
+        )
+        train_segmenter(build(parser, LabelTrainConfig, parser.parse_args(arguments[1:])))
+        return
+    from pred.label import LabelConfig
+    from pred.label import label as run_labelling
+
+    parser = config_parser(
+        "pred label",
+        "Pseudo labels of a segmentation network, at the pixels of LiDAR returns. `pred label train` trains one.",
+        LabelConfig,
+    )
+    run_labelling(build(parser, LabelConfig, parser.parse_args(arguments)))
 
 
 def data(arguments: list[str]) -> None:
@@ -236,7 +262,8 @@ COMMANDS = {
         evaluate, "evaluate rendering RUN, probe RUN: errors, a linear probe; once FILE: AP of 3D boxes"
     ),
     "view": Command(view, "view RUN: pictures of what the run renders"),
-    "world": Command(world, "make OUT: a data set of procedural towns in the nuScenes layout"),
+    "world": Command(world, "make OUT: a data set of procedural towns in the nuScenes or ONCE layout"),
+    "label": Command(label, "pseudo labels of images by a segmentation network; label train makes one"),
     "data": Command(data, "data check ROOT: what is missing or broken in a data set"),
     "doctor": Command(doctor, "versions, backend, machine, and what is missing"),
 }

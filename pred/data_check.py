@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import time
+from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -18,15 +19,18 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
 from pred.data import folder as own
 from pred.data import nuscenes, once
 from pred.data.frame import FrameError, check_image_header, open_image, rgb_image_size
+from pred.data.index import FrameIndex
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
-from pred.data.tables import read_json
+from pred.data.tables import Row, read_json, read_table, reading_progress
 from pred.progress import Progress, format_duration
 
 MAX_EXAMPLES = 3
@@ -188,6 +192,7 @@ def check_nuscenes(
         if not (tables / f"{name}.json").is_file():
             report.note(f"{tables / name}.json is missing: only the official devkit needs it")
     index = nuscenes.build_index(tables, report.add)
+    _check_readings(tables, report)
     sweeps, images = index.sweeps, index.images
     label_files = _label_folder(root, labels, report)
     scenes = set(index.recording.to_pylist())
@@ -224,6 +229,53 @@ def check_nuscenes(
 
     files_per_image = 1 if label_files is None else 2
     return len(sweeps.path) + files_per_image * len(images.path), checks()
+
+
+def _check_readings(tables: Path, report: Report) -> None:
+    """Rows of sample_data among each other: tokens, prev and next, keyframes. What is wrong with a row by itself
+    was reported before; such rows are left out."""
+    path = tables / "sample_data.json"
+
+    def read(name: str, read_row: Callable[[Row], Any]) -> dict[str, str]:
+        return dict(read_table(tables / f"{name}.json", read_row, report=lambda problem: None))
+
+    channels = read("sensor", lambda row: (row["token"], row["channel"]))
+    channel_of = read("calibrated_sensor", lambda row: (row["token"], channels[row["sensor_token"]]))
+    scene_of = read("sample", lambda row: (row["token"], row["scene_token"]))
+    numbers = array("q")  # five for each row: hashes, since the texts of millions of rows take gigabytes
+
+    def read_row(row: Row) -> None:
+        sample, channel = row["sample_token"], channel_of[row["calibrated_sensor_token"]]
+        links = [hash(row[key]) if row[key] else 0 for key in ("token", "prev", "next")]
+        keyframe = hash((sample, channel)) if row["is_key_frame"] else 0
+        numbers.extend((*links, hash((scene_of[sample], channel)), keyframe))
+
+    with reading_progress("checking sample_data", [path]) as advance:
+        read_table(path, read_row, lambda problem: None, advance)
+    columns = np.frombuffer(numbers, dtype=np.int64).reshape(-1, 5).T
+    token, chain, keyframe = columns[0], columns[3], columns[4]
+
+    def add(rows: NDArray[np.int64], what: str, others: NDArray[np.int64] | None = None) -> None:
+        for number, row in enumerate(rows.tolist()):
+            got = "no such row" if others is None else f"row {others[number] + 1}"
+            report.add(FrameError(path, f"row {row + 1} {what}, got {got}"))
+
+    for values, what in (
+        (token, "must have a token of its own"),
+        (keyframe, "must be the only keyframe of its sample and channel"),
+    ):
+        order = np.argsort(values, kind="stable")
+        again = np.flatnonzero((np.diff(values[order]) == 0) & (values[order][1:] != 0))
+        add(order[again + 1], what, order[again])
+    order = np.argsort(token, kind="stable")
+    for key, link in (("prev", columns[1]), ("next", columns[2])):
+        named = np.flatnonzero(link)
+        place = np.minimum(np.searchsorted(token[order], link[named]), len(token) - 1)
+        found = order[place]
+        there = token[found] == link[named]
+        add(named[~there], f"must name a {key} that is in the table")
+        strange = there & (chain[found] != chain[named])
+        add(named[strange], f"must have its {key} in its own scene and channel", found[strange])
 
 
 def check_folder(
@@ -271,37 +323,43 @@ def check_once(
     names = once.sequence_names(root)
     for split in sorted((root / "ImageSets").glob("*.txt")):
         report.attempt(partial(_check_once_split, split, set(names)))
-    sequences: list[once.OnceSequence] = []
-    for name in names:
-        report.attempt(lambda name=name: sequences.append(once.read_sequence(root / "data" / name)))  # type: ignore[misc]
-    frames = sum(len(sequence.frame_ids) for sequence in sequences)
-    images = sum(len(sequence.frame_ids) * len(sequence.calibrations) for sequence in sequences)
-    annotations = [annotation for sequence in sequences for annotation in sequence.annotations.values()]
+    index = once.build_index(root, report.add)
+    images, poses = index.images, index.sweeps.pose
     report.counts = {
         "sequences": len(names),
-        "frames": frames,
-        "annotated frames": len(annotations),
-        "images": images,
-        "boxes": sum(len(annotation.names) for annotation in annotations),
+        "frames": len(index),
+        "annotated frames": int(np.count_nonzero(index.boxes.annotated)),
+        "images": len(images.path),
+        "boxes": len(index.boxes.name),
     }
-    without_pose = sum(int(np.count_nonzero(np.isnan(sequence.poses[:, 0]))) for sequence in sequences)
+    without_pose = int(np.count_nonzero(poses < 0))
     if without_pose:
         report.note(f"{without_pose:,} frames have no pose; they are placed at the origin")
+    # Images of one camera of one sequence are as far apart as its frames have cameras.
+    cameras_of_frame = np.diff(images.offsets)
+    used, first, count = np.unique(images.calibration, return_index=True, return_counts=True)
+    lenses = [
+        (int(calibration), range(start, start + step * number, step))
+        for calibration, start, number in zip(used, first.tolist(), count.tolist(), strict=True)
+        if any(index.calibrations.distortion[calibration].as_py())
+        for step in [cameras_of_frame[once.frame_of(images, start)]]
+    ]
 
     def checks() -> Iterator[Check]:
-        for sequence in sequences:
-            for frame_id in sequence.frame_ids.tolist():
-                scan = sequence.folder / once.LIDAR / f"{frame_id}.bin"
-                yield partial(once.check_scan_size, scan) if fast else partial(_read, once.read_scan, scan)
-                for camera in sequence.calibrations:
-                    image = sequence.folder / camera / f"{frame_id}.jpg"
-                    yield partial(_check_image, image, None, label_files is not None, fast, report)
-                    if label_files is not None:
-                        folder = label_files / sequence.folder.name / camera
-                        yield partial(_check_once_label, image, folder, fast)
+        for calibration, rows in lenses:
+            yield partial(_check_lens, root, index, calibration, rows)
+        for frame in range(len(index)):
+            scan = root / str(index.sweeps.path[frame])
+            yield partial(once.check_scan_size, scan) if fast else partial(_read, once.read_scan, scan)
+            for row in range(*images.offsets[frame : frame + 2]):
+                image = root / str(images.path[row])
+                yield partial(_check_image, image, None, label_files is not None, fast, report)
+                if label_files is not None:
+                    folder = label_files / image.relative_to(root / "data").parent
+                    yield partial(_check_once_label, image, folder, fast)
 
     files_per_image = 1 if label_files is None else 2
-    return frames + files_per_image * images, checks()
+    return len(lenses) + len(index) + files_per_image * len(images.path), checks()
 
 
 LAYOUTS: dict[str, Callable[[Path, str | None, str | None, bool, Report], tuple[int, Iterator[Check]]]] = {
@@ -344,6 +402,17 @@ def _check_label(folder: Path, stem: str, width: int, height: int, fast: bool) -
         PseudoLabel(file, width, height).class_map()
     elif file.stat().st_size == 0:
         raise FrameError(file, "label must be a readable file, got an empty one")
+
+
+def _check_lens(root: Path, index: FrameIndex, calibration: int, images: range) -> None:
+    """Whether the distortion of one camera of one sequence can be undone; ``images`` are rows of its images."""
+    for row in images:
+        try:
+            width, height = rgb_image_size(root / str(index.images.path[row]))
+        except FrameError:
+            continue  # which the image's own check says
+        once.pinhole_intrinsics(root, index, calibration, width, height)
+        return
 
 
 def _check_once_label(image: Path, folder: Path, fast: bool) -> None:

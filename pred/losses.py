@@ -8,6 +8,7 @@ holds does not matter, NaN included.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -29,6 +30,9 @@ class LossConfig:
     """Weight of the depth term."""
     eikonal_weight: float = 0.1
     """Weight of the Eikonal term (lambda of the paper)."""
+    semantic_at: Literal["ray", "return"] = "ray"
+    """Where classes are compared with the pseudo label: rendered along the ray, or (direct projection, an ablation) the
+    field's at the LiDAR return itself, without rendering."""
     depth_unit_m: float = 4.0
     """Depth errors are counted in this unit, metres: squared metres would drown the other terms."""
 

@@ -33,7 +33,7 @@ import torch
 
 import pred
 from pred._native import native_status
-from pred.checkpoint import write_text
+from pred.checkpoint import TEMPORARY_SUFFIX, write_text
 
 
 class RunFolderError(RuntimeError):
@@ -111,6 +111,35 @@ class RunFolder:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Replace ``path`` with ``content`` as indented JSON, atomically."""
     write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def claim_settings(path: Path, wanted: Mapping[str, Any]) -> None:
+    """Make the folder of ``path`` that of a job with these settings, or check that it is.
+
+    Raises:
+        RunFolderError: it holds a job with other settings, or foreign files. The text names what differs.
+    """
+    folder = path.parent
+    if not path.is_file():
+        held = (
+            [file.name for file in folder.iterdir() if not file.name.endswith(TEMPORARY_SUFFIX)]
+            if folder.is_dir()
+            else []
+        )
+        if folder.exists() and (held or not folder.is_dir()):
+            raise RunFolderError(f"{folder}: must be a new folder, got one that holds {(held or ['a file'])[0]}")
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(path, wanted)
+        return
+    try:
+        found = json.loads(path.read_text())
+    except ValueError as error:
+        raise RunFolderError(f"{path}: must be the settings of the job, got no valid JSON: {error}") from None
+    wanted = json.loads(json.dumps(wanted))
+    for name in sorted({*wanted, *found} if isinstance(found, dict) else wanted):
+        value = found.get(name) if isinstance(found, dict) else None
+        if value != wanted.get(name):
+            raise RunFolderError(f"{path}: {name} must be {wanted.get(name)!r} as asked for, got {value!r}")
 
 
 def environment() -> dict[str, Any]:

@@ -2,17 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The job `pred world make`: drives of the procedural world, written as a data set.
 
-OUT/world.json     the settings; an OUT with others is refused
-OUT/.parts/        one file per finished keyframe, for a run that continues; gone once the tables are there
-OUT/<version>/     the tables; they appear last and all at once
-OUT/samples, sweeps, lidarseg, maps, pseudo: see `pred.data.world.nuscenes_writer`
+OUT/world.json     settings and versions of libraries; an OUT with others is refused
+OUT/.parts/        nuScenes: one file per finished keyframe, for a run that continues; gone once the tables are there
+OUT/<version>/     nuScenes: the tables; they appear last and all at once
+OUT/data/          ONCE: sequences, each appears as a whole; the lists in OUT/ImageSets come last
+The rest: see `pred.data.world.nuscenes_writer` and `pred.data.world.once_layout`.
 
-Keyframes are made by a pool of processes, each file under a temporary name first. Every file is a function of the
-settings alone, so a run may be killed at any moment and continued with any number of workers.
+Keyframes (nuScenes) or sequences (ONCE) are made by a pool of processes, each file under a temporary name first. Every
+file is a function of settings and libraries alone, so a run may be killed at any moment and continued with any number
+of workers.
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
 import multiprocessing
 import os
@@ -25,14 +28,17 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import lru_cache, partial
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pred
 from pred.checkpoint import TEMPORARY_SUFFIX, write_text
 from pred.data.world.nuscenes_writer import Part, WorldSettings, write_dataset, write_keyframe
+from pred.data.world.once_layout import once_splits, sequence_name, write_sequence, write_splits
 from pred.progress import Progress, format_duration
 
+Job = tuple[int, ...]
 MakeDrive = Callable[[int, int, int], Any]
 """(seed, scene, keyframes) to a `pred.data.world.drive.Drive`."""
 
@@ -53,7 +59,7 @@ def make_world(
         make_drive: replaces the procedural drives. It must be importable by name where workers is not 1.
 
     Raises:
-        WorldFolderError: ``out`` holds other settings or foreign files.
+        WorldFolderError: ``out`` holds other settings or foreign files, or another process writes to it.
         ValueError: ``workers`` is less than 1.
     """
     if make_drive is None:
@@ -63,38 +69,102 @@ def make_world(
     workers = (os.cpu_count() or 1) if workers is None else workers
     if workers < 1:
         raise ValueError(f"world: workers must be at least 1, got {workers}")
-    _claim(out, settings)
-    parts = out / ".parts"
-    if (out / settings.version).is_dir():
-        shutil.rmtree(parts, ignore_errors=True)
-        print(f"{out}: the world is complete; nothing to do")
-        return
+    work = _LAYOUTS[settings.layout](out, settings, make_drive)
+    with _lock(out):
+        _claim(out, settings, work)
+        if work.is_complete():
+            shutil.rmtree(out / ".parts", ignore_errors=True)
+            print(f"{out}: the world is complete; nothing to do")
+        else:
+            _do(out, settings, work, workers)
 
-    keyframes = [(scene, number) for scene in range(settings.scenes) for number in range(settings.keyframes)]
-    missing = [key for key in keyframes if not _part_file(parts, *key).is_file()]
+
+class _Work(NamedTuple):
+    """How a layout is made: jobs in any order and by any process, then what completes the data set.
+
+    Attributes:
+        unit: what a job makes.
+        jobs: all of them.
+        is_done: whether a job's files are whole.
+        do: runs one job. It goes to other processes.
+        finish: completes the data set; returns the bytes of all files of the keyframes.
+        is_complete: whether that has happened.
+        folders: names in OUT.
+    """
+
+    unit: str
+    jobs: list[Job]
+    is_done: Callable[[Job], bool]
+    do: Callable[[Job], None]
+    finish: Callable[[], int]
+    is_complete: Callable[[], bool]
+    folders: frozenset[str]
+
+
+def _do(out: Path, settings: WorldSettings, work: _Work, workers: int) -> None:
+    missing = [job for job in work.jobs if not work.is_done(job)]
     start_time = time.monotonic()
-    progress = Progress("keyframes", len(keyframes), done=len(keyframes) - len(missing))
+    progress = Progress(work.unit, len(work.jobs), done=len(work.jobs) - len(missing))
+    keyframes_a_job = settings.scenes * settings.keyframes // len(work.jobs)
     with progress, _pool(workers) as run:
-        for done, _ in enumerate(run(partial(_make_keyframe, out, settings, make_drive), missing), start=1):
-            rate = done / (time.monotonic() - start_time)
-            progress.update(len(keyframes) - len(missing) + done, f"{rate:.2f} keyframes/s")
+        for done, _ in enumerate(run(work.do, missing), start=1):
+            rate = done * keyframes_a_job / (time.monotonic() - start_time)
+            progress.update(len(work.jobs) - len(missing) + done, f"{rate:.2f} keyframes/s")
     elapsed_s = time.monotonic() - start_time
 
     for leftover in out.rglob(f".*{TEMPORARY_SUFFIX}"):
         if leftover.is_file():
             leftover.unlink()
-    num_bytes = write_dataset(out, settings, _read_parts(parts, settings))
-    shutil.rmtree(parts)
-    rate_text = f"{len(missing)} made in {format_duration(elapsed_s)}, {len(missing) / elapsed_s:.2f} keyframes/s"
+    num_bytes = work.finish()
+    shutil.rmtree(out / ".parts", ignore_errors=True)
+    made, keyframes = len(missing) * keyframes_a_job, settings.scenes * settings.keyframes
     print(
-        f"{out}: {settings.scenes} scenes, {len(keyframes)} keyframes; {rate_text}; "
-        f"{num_bytes / len(keyframes) / 1e6:.2f} MB per keyframe"
+        f"{out}: {settings.scenes} scenes, {keyframes} keyframes; {made} made in {format_duration(elapsed_s)}, "
+        f"{made / elapsed_s:.2f} keyframes/s; {num_bytes / keyframes / 1e6:.2f} MB per keyframe"
     )
 
 
-def _make_keyframe(out: Path, settings: WorldSettings, make_drive: MakeDrive, key: tuple[int, int]) -> None:
+# The layouts
+
+
+def _nuscenes(out: Path, settings: WorldSettings, make_drive: MakeDrive) -> _Work:
+    """A job is a keyframe, (scene, number)."""
+    parts = out / ".parts"
+    return _Work(
+        unit="keyframes",
+        jobs=[(scene, number) for scene in range(settings.scenes) for number in range(settings.keyframes)],
+        is_done=lambda job: _part_file(parts, *job).is_file(),
+        do=partial(_make_keyframe, out, settings, make_drive),
+        finish=lambda: write_dataset(out, settings, _read_parts(parts, settings)),
+        is_complete=(out / settings.version).is_dir,
+        folders=frozenset({"samples", "sweeps", "lidarseg", "maps", "pseudo", "depth", settings.version}),
+    )
+
+
+def _once(out: Path, settings: WorldSettings, make_drive: MakeDrive) -> _Work:
+    """A job is a sequence, (scene,)."""
+    lists = [out / "ImageSets" / f"{split}.txt" for split in once_splits(settings.scenes)]
+    return _Work(
+        unit="sequences",
+        jobs=[(scene,) for scene in range(settings.scenes)],
+        is_done=lambda job: (out / "data" / sequence_name(*job)).is_dir(),
+        do=partial(_make_sequence, out, settings, make_drive),
+        finish=lambda: write_splits(out, settings),
+        is_complete=lambda: all(path.is_file() for path in lists),
+        folders=frozenset({"data", "ImageSets", "pseudo", "depth"}),
+    )
+
+
+_LAYOUTS: dict[str, Callable[[Path, WorldSettings, MakeDrive], _Work]] = {"nuscenes": _nuscenes, "once": _once}
+
+
+def _make_sequence(out: Path, settings: WorldSettings, make_drive: MakeDrive, job: Job) -> None:
+    write_sequence(out, settings, _drive(make_drive, settings.seed, *job, settings.keyframes), *job)
+
+
+def _make_keyframe(out: Path, settings: WorldSettings, make_drive: MakeDrive, job: Job) -> None:
     """Files and part of one keyframe. The part comes last: where it is, the files are whole."""
-    scene, number = key
+    scene, number = job
     drive = _drive(make_drive, settings.seed, scene, settings.keyframes)
     part = write_keyframe(out, settings, drive, scene, number)
     path = _part_file(out / ".parts", scene, number)
@@ -121,31 +191,54 @@ def _part_file(parts: Path, scene: int, number: int) -> Path:
 # The folder
 
 
-def _claim(out: Path, settings: WorldSettings) -> None:
-    """Make the folder the settings' own, or check that it is."""
-    record = out / "world.json"
-    wanted = {**asdict(settings), "made_by": f"pred {pred.__version__}"}
-    held = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
+@contextmanager
+def _lock(out: Path) -> Iterator[None]:
+    """Make the folder if need be and hold it for this process. The lock leaves no file and ends with the process."""
     if out.exists() and not out.is_dir():
         raise WorldFolderError(f"{out}: must be a folder, got a file")
+    out.mkdir(parents=True, exist_ok=True)
+    folder = os.open(out, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise WorldFolderError(f"{out}: must have one writer, got another process") from None
+        yield
+    finally:
+        os.close(folder)
+
+
+def _libraries() -> dict[str, str]:
+    """Versions of the packages on which the bytes of the files depend."""
+    return {name: metadata.version(name) for name in ("embreex", "numpy", "pillow")}
+
+
+def _claim(out: Path, settings: WorldSettings, work: _Work) -> None:
+    """Make the folder the settings' own, or check that it is."""
+    record = out / "world.json"
+    wanted = {**asdict(settings), "made_by": f"pred {pred.__version__}", "libraries": _libraries()}
+    held = sorted(path.name for path in out.iterdir())
     if not record.is_file():
         foreign = [name for name in held if not name.startswith(f".{record.name}.")]
         if foreign:
             raise WorldFolderError(f"{out}: must be new or empty, or hold an interrupted world, got {foreign[0]}")
-        out.mkdir(parents=True, exist_ok=True)
         write_text(record, json.dumps(wanted, indent=2) + "\n")
         return
     try:
         found = json.loads(record.read_text())
     except ValueError as error:
         raise WorldFolderError(f"{record}: must be the settings of a world, got no valid JSON: {error}") from None
+    complete = work.is_complete()
     for name in wanted:
+        if name == "libraries" and complete:  # no more files come
+            continue
         value = found.get(name) if isinstance(found, dict) else None
         if value != wanted[name]:
-            raise WorldFolderError(f"{record}: {name} must be {wanted[name]!r} as asked for, got {value!r}")
-    own = {record.name, ".parts", "samples", "sweeps", "lidarseg", "maps", "pseudo", settings.version}
-    if settings.version in held:  # complete: other jobs may add to it
+            source = "here" if name in ("libraries", "made_by") else "asked for"
+            raise WorldFolderError(f"{record}: {name} must be {wanted[name]!r} as {source}, got {value!r}")
+    if complete:  # other jobs may add to it
         return
+    own = {record.name, ".parts", *work.folders}
     foreign = [name for name in held if name not in own and not name.endswith(TEMPORARY_SUFFIX)]
     if foreign:
         raise WorldFolderError(f"{out}: must hold nothing but the interrupted world, got {foreign[0]}")
@@ -153,7 +246,7 @@ def _claim(out: Path, settings: WorldSettings) -> None:
 
 # Processes
 
-Run = Callable[[Callable[[tuple[int, int]], None], list[tuple[int, int]]], Iterable[None]]
+Run = Callable[[Callable[[Job], None], list[Job]], Iterable[None]]
 
 
 @contextmanager
@@ -167,9 +260,9 @@ def _pool(workers: int) -> Iterator[Run]:
         return
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker) as pool:
 
-        def run(function: Callable[[tuple[int, int]], None], keys: list[tuple[int, int]]) -> Iterator[None]:
-            for job in as_completed([pool.submit(function, key) for key in keys]):
-                yield job.result()
+        def run(function: Callable[[Job], None], jobs: list[Job]) -> Iterator[None]:
+            for done in as_completed([pool.submit(function, job) for job in jobs]):
+                yield done.result()
 
         try:
             yield run

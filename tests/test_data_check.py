@@ -7,6 +7,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,7 +61,7 @@ def damage_everything(tree: Tree) -> dict[Path, str]:
     (tree.tables / "splits.json").write_text('{"first": ["scene-x"]}')
     return {
         tree.keyframe_files[0]: "points must be finite",
-        tree.sweep_files[0]: "sweep must hold whole points",
+        tree.sweep_files[0]: "sweep file must hold whole points",
         tree.sweep_files[1]: "sweep file must exist",
         image: "image file must be readable",
         tree.images[1]["CAM_BACK"]: "image file must be readable",
@@ -111,6 +112,42 @@ def test_broken_tables(tree: Tree, table: str, change: Callable[..., None], rule
     report, text = check(tree.root)
     found = sum(count for name, count in counts(report).items() if rule in name)
     assert found == number and f"{table}.json: " in text
+
+
+@pytest.mark.parametrize(
+    ("change", "rule", "number"),
+    [
+        (lambda rows: rows[0].update(next="gone"), "must name a next that is in the table", 1),
+        (lambda rows: [row.update(prev="gone") for row in rows[:3]], "must name a prev that is in the table", 3),
+        (lambda rows: rows.append(dict(rows[0])), "must have a token of its own", 1),
+        (
+            lambda rows: rows.append({**next(row for row in rows if row["is_key_frame"]), "token": "another"}),
+            "must be the only keyframe of its sample and channel",
+            1,
+        ),
+    ],
+)
+def test_readings_among_each_other(
+    tree: Tree, change: Callable[[list[dict[str, Any]]], Any], rule: str, number: int
+) -> None:
+    tree.edit("sample_data", change)
+    report, text = check(tree.root, fast=True)
+    found = {known: count for known, count in counts(report).items() if rule in known}
+    assert list(found.values()) == [number], text
+    assert f"{tree.tables / 'sample_data.json'}: row " in text
+
+
+def test_a_sweep_whose_prev_is_of_another_scene(tmp_path: Path) -> None:
+    tree = write_tree(tmp_path, scenes=("scene-a", "scene-b"))
+
+    def change(rows: list[dict[str, Any]]) -> None:
+        sweeps = [row for row in rows if row["calibrated_sensor_token"] == "calibrated-LIDAR_TOP"]
+        assert len(sweeps) == 8 and sweeps[4]["prev"] == ""
+        sweeps[4]["prev"] = sweeps[3]["token"]
+
+    tree.edit("sample_data", change)
+    report, _ = check(tree.root, fast=True)
+    assert counts(report) == {"row … must have its prev in its own scene and channel": 1}
 
 
 @pytest.mark.parametrize("table", ["sensor", "sample", "sample_data", "ego_pose", "category", "sample_annotation"])

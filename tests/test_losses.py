@@ -107,7 +107,7 @@ def test_gradients_of_all_terms() -> None:
 @pytest.mark.parametrize("name", ["semantic_weight", "depth_weight", "eikonal_weight"])
 def test_negative_weight_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=f"{name} must not be negative, got -1"):
-        LossConfig(**{name: -1.0})
+        LossConfig(**{name: -1.0})  # type: ignore[arg-type]
 
 
 def test_depth_unit_must_be_positive() -> None:

@@ -193,10 +193,12 @@ class SemanticRays(Rays):
     """Rays from cameras through projected LiDAR returns.
 
     Attributes:
+        range_m: [B, R] float32, distance from the origin to the return.
         target: [B, R, 19] float32 class probabilities of the pseudo label at the pixel.
         confidence: [B, R] float32, the largest of them; 1 for hard labels.
     """
 
+    range_m: Tensor
     target: Tensor
     confidence: Tensor
 
@@ -647,6 +649,7 @@ def _collate(
             directions=_stack([rays.directions for rays in semantic], num_semantic_rays, UPWARDS),
             valid=_stack([np.ones(len(rays.class_id), bool) for rays in semantic], num_semantic_rays, 0),
             jitter=_stack([draw.semantic_jitter for draw in draws], num_semantic_rays, 0.0),
+            range_m=_stack([rays.range_m for rays in semantic], num_semantic_rays, 1.0),
             target=_stack([rays.target for rays in semantic], num_semantic_rays, 0.0),
             confidence=_stack([rays.confidence for rays in semantic], num_semantic_rays, 0.0),
         ),

@@ -35,11 +35,12 @@ from pred.data.frame import (
     invert_rigid,
     require_inside,
     require_intrinsics,
+    unreadable,
 )
 from pred.data.image_depth import DepthMap, depth_folder
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
 from pred.data.pcd import read_pcd, read_pcd_header
-from pred.data.sweeps import Sweep, accumulate, require_finite_points
+from pred.data.sweeps import Sweep, accumulate, check_points_size, read_points, require_finite_points
 from pred.data.tables import read_json
 
 DESCRIPTION = "drive.yaml"
@@ -295,7 +296,7 @@ def read_scan(path: Path, columns: list[str]) -> NDArray[np.float32]:
     elif path.suffix == ".npy":
         points = _from_columns(np.asarray(_map_npy(path, columns)), columns)
     else:
-        points = _from_columns(_read_bin(path, columns), columns)
+        points = _from_columns(read_points(path, columns), columns)
     if not len(points):
         raise FrameError(path, "scan must hold points, got none")
     require_finite_points(path, points)
@@ -313,10 +314,7 @@ def check_scan_header(path: Path, columns: list[str]) -> None:
     elif path.suffix == ".npy":
         _map_npy(path, columns)
     else:
-        try:
-            _require_whole_points(path, path.stat().st_size, columns)
-        except OSError as error:
-            raise _unreadable(path, error) from None
+        check_points_size(path, columns)
 
 
 def find_image_file(folder: Path, stem: str) -> Path:
@@ -325,28 +323,11 @@ def find_image_file(folder: Path, stem: str) -> Path:
     return next((path for path in candidates if path.is_file()), candidates[0])
 
 
-def _read_bin(path: Path, columns: list[str]) -> NDArray[np.float32]:
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise _unreadable(path, error) from None
-    _require_whole_points(path, len(content), columns)
-    return np.frombuffer(content, dtype="<f4").reshape(-1, len(columns))
-
-
-def _require_whole_points(path: Path, num_bytes: int, columns: list[str]) -> None:
-    point = 4 * len(columns)
-    if num_bytes == 0 or num_bytes % point:
-        names = ", ".join(columns)
-        what = f"scan must hold whole points of {point} bytes (float32 {names}), got {num_bytes} bytes: truncated?"
-        raise FrameError(path, what)
-
-
 def _map_npy(path: Path, columns: list[str]) -> NDArray[Any]:
     try:
         points = npy_format.open_memmap(path, mode="r")
     except OSError as error:
-        raise _unreadable(path, error) from None
+        raise unreadable(path, error, "scan") from None
     # A damaged header surfaces as ValueError, SyntaxError, EOFError, OverflowError, ...
     except Exception as error:
         raise FrameError(path, f"scan must be a readable .npy file, got {type(error).__name__}: {error}") from None
@@ -378,12 +359,6 @@ def _require_fields(path: Path, dtype: np.dtype[Any]) -> None:
     missing = [name for name in POINT_FIELDS[:3] if name not in names]
     if missing or any(dtype[name].shape for name in POINT_FIELDS if name in names):
         raise FrameError(path, f".pcd file must have the single fields x, y, z, got {', '.join(names)}")
-
-
-def _unreadable(path: Path, error: OSError) -> FrameError:
-    if isinstance(error, FileNotFoundError):
-        return FrameError(path, "scan must exist, got no such file")
-    return FrameError(path, f"scan must be readable, got {error}")
 
 
 def _check_pose_line(path: Path, number: int, stem: str, values: list[float]) -> None:

@@ -49,6 +49,13 @@ class FrameError(ValueError):
         return f"{self.path}: {self.what}"
 
 
+def unreadable(path: Path, error: OSError, what: str, hint: str = "") -> FrameError:
+    """The error of a file that is missing (``hint`` says what to do) or cannot be opened; ``what`` it is."""
+    if isinstance(error, FileNotFoundError):
+        return FrameError(path, f"{what} must exist, got no such file{hint}")
+    return FrameError(path, f"{what} must be readable, got {error}")
+
+
 @dataclass
 class Camera:
     """A calibrated pinhole camera of one frame.

@@ -4,11 +4,12 @@
 
 Reading the tables of a large data set takes a minute and gigabytes; its index opens in a moment, and the processes that
 use it share its pages. The file is a cache: it names the tables that it was made from with their sizes and
-modification times, and is made anew when one of them has changed.
+modification times, and is made anew when one of them has changed, or when its checksum shows that it is damaged.
 
 The file holds Arrow IPC streams, one after the other, one per table of `SCHEMAS`, each with one record batch. The first
-one's metadata tells the format's version and the sources. Paths are relative to the root of the data set. A pose is a
-translation (metres) and a unit quaternion w, x, y, z.
+one's metadata tells the format's version and the sources. The last four bytes are the CRC-32 of all before them, lowest
+byte first. Paths are relative to the root of the data set. A pose is a translation (metres) and a unit quaternion
+w, x, y, z.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ import fcntl
 import hashlib
 import json
 import os
+import warnings
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,12 +33,14 @@ import pyarrow.ipc
 from numpy.typing import NDArray
 
 from pred.checkpoint import atomic_write, remove_leftovers
-from pred.data.frame import FrameError
+from pred.data.frame import Frame, FrameError, pose_matrix
 
 FILE_NAME = "pred_index.arrow"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Counts changes of `SCHEMAS` and of what the columns mean; files of another version are made anew."""
 
+_CHECKSUM_BYTES = 4
+_CHUNK_BYTES = 1 << 22
 _METADATA_KEY = b"pred_index"
 _POSE = pa.list_(pa.float64(), 7)
 _READING = [("path", pa.string()), ("time_us", pa.int64()), ("calibration", pa.int32()), ("pose", pa.int32())]
@@ -59,6 +64,7 @@ SCHEMAS = {
             ("recording", pa.string()),
             ("sweep", pa.int32()),
             ("images", pa.list_(_IMAGE)),
+            ("annotated", pa.uint8()),
             ("boxes", pa.list_(_BOX)),
         ]
     ),
@@ -119,7 +125,7 @@ class Images(Readings):
     """Camera images; frame f owns rows ``offsets[f]:offsets[f + 1]``.
 
     Attributes:
-        width, height: [n] pixels.
+        width, height: [n] pixels; 0 where only the image's header tells.
         offsets: [F + 1].
     """
 
@@ -134,15 +140,17 @@ class IndexedBoxes:
 
     Attributes:
         name: [m] category.
-        pose: [m, 7] world from box.
+        pose: [m, 7] from box to the world (nuScenes) or to the frame's LiDAR (ONCE), as the data set has it.
         size_lwh: [m, 3] metres.
         offsets: [F + 1].
+        annotated: [F] whether somebody looked for objects in the frame.
     """
 
     name: pa.StringArray
     pose: NDArray[np.float64]
     size_lwh: NDArray[np.float64]
     offsets: NDArray[np.int32]
+    annotated: NDArray[np.bool_]
 
 
 @dataclass
@@ -178,26 +186,71 @@ class FrameIndex:
         return np.flatnonzero(mask.to_numpy(zero_copy_only=False))
 
 
+class IndexedFrames:
+    """What the readers of data sets with an index have in common; they set the three attributes.
+
+    Attributes:
+        root: folder of the data set.
+        _index: the index of all its frames.
+        _rows: [n] rows of the index that are this source's frames, in order.
+    """
+
+    root: Path
+    _index: FrameIndex
+    _rows: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def token(self, index: int) -> str:
+        """Identity of frame ``index``."""
+        return str(self._index.token[self._row(index)])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_index"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """In another process the file is opened again, instead of sending its content there."""
+        vars(self).update(state)
+        self._index = self._open_index()
+
+    def load(self, index: int) -> Frame:
+        """Frame ``index``."""
+        raise NotImplementedError
+
+    def _open_index(self) -> FrameIndex:
+        raise NotImplementedError
+
+    def _row(self, index: int) -> int:
+        """Row of the index of frame ``index``."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"index must be in [0, {len(self)}), got {index}")
+        return int(self._rows[index])
+
+    def _file(self, readings: Readings, row: int) -> Path:
+        return self.root / str(readings.path[row])
+
+
 def open_index(folder: Path, sources: Sequence[Path], build: Callable[[], FrameIndex]) -> FrameIndex:
-    """The index of the data set whose tables lie in ``folder``; made first where it is missing or out of date.
+    """The index of the data set whose tables lie in ``folder``; made first where it is missing, out of date or damaged.
 
     It lies in ``folder``, or in the user's cache folder (``$XDG_CACHE_HOME/pred``) where that cannot be written. Of
     several processes one makes it, the others wait.
 
     Args:
         folder: folder of the tables.
-        sources: files that the index depends on.
+        sources: files below it that the index depends on.
         build: reads them.
 
     Raises:
         FrameError: a table is missing or damaged, or the index can be written nowhere.
     """
     places = index_files(folder)
-    index = _first_fresh(places, _stamp(sources))
+    index = _first_fresh(places, _stamp(folder, sources))
     if index is not None:
         return index
     with _locked(folder):
-        stamp = _stamp(sources)  # before they are read: what changes from now on makes the index stale
+        stamp = _stamp(folder, sources)  # before they are read: what changes from now on makes the index stale
         index = _first_fresh(places, stamp)
         return index if index is not None else _write_and_open(places, build(), stamp)
 
@@ -218,26 +271,59 @@ def write_index(path: Path, index: FrameIndex, stamp: Stamp) -> None:
             metadata = {}
             with pa.ipc.new_stream(file, schema) as writer:
                 writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
+        file.flush()
+        file.write(_checksum(Path(file.name), file.tell()))
 
 
 def read_index(path: Path, stamp: Stamp) -> FrameIndex | None:
-    """Open an index file; None where there is none, or none of this format and of these sources."""
+    """Open an index file; None where there is none, or none of this format and of these sources.
+
+    Warns:
+        UserWarning: the file is damaged; None.
+    """
     try:
-        source = pa.memory_map(str(path))
+        return _read_index(path, stamp)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, ValueError, pa.ArrowException) as error:
+        warnings.warn(f"{path}: index must be intact, got {error}; it is made anew", UserWarning, stacklevel=2)
+        return None
+
+
+def _read_index(path: Path, stamp: Stamp) -> FrameIndex | None:
+    with pa.memory_map(str(path)) as source:
+        header = json.loads((pa.ipc.open_stream(source).schema.metadata or {}).get(_METADATA_KEY, b"null"))
+        if header != {"version": FORMAT_VERSION, "sources": stamp}:
+            return None
+        # Read and not mapped: the pages do not become this process's.
+        size = source.size() - _CHECKSUM_BYTES
+        source.seek(size)
+        if source.read() != _checksum(path, size):
+            raise ValueError("a wrong checksum")
+        source.seek(0)
         batches: dict[str, pa.RecordBatch] = {}
         for name, schema in SCHEMAS.items():
             reader = pa.ipc.open_stream(source)
-            if not batches:
-                header = json.loads((reader.schema.metadata or {}).get(_METADATA_KEY, b"null"))
-                if header != {"version": FORMAT_VERSION, "sources": stamp}:
-                    return None
             if not reader.schema.equals(schema):
-                return None
+                raise ValueError(f"another schema of {name}")
             (batches[name],) = reader
             _require_sound(batches[name])
-    except (OSError, ValueError, pa.ArrowException):  # missing, cut short, or something else under this name
-        return None
-    return _from_batches(batches)
+        return _from_batches(batches)
+
+
+def _checksum(path: Path, size: int) -> bytes:
+    """CRC-32 of the first ``size`` bytes of a file."""
+    crc = 0
+    with open(path, "rb") as file:
+        while size > 0 and (chunk := file.read(min(size, _CHUNK_BYTES))):
+            crc = zlib.crc32(chunk, crc)
+            size -= len(chunk)
+    return crc.to_bytes(_CHECKSUM_BYTES, "little")
+
+
+def rigid(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[4, 4] matrix of one pose of an index, [7]."""
+    return pose_matrix(pose[:3], pose[3:])
 
 
 def strings(values: Sequence[str]) -> pa.StringArray:
@@ -296,8 +382,8 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _stamp(sources: Sequence[Path]) -> Stamp:
-    return {path.name: _size_and_time(path) for path in sources}
+def _stamp(folder: Path, sources: Sequence[Path]) -> Stamp:
+    return {str(path.relative_to(folder)): _size_and_time(path) for path in sources}
 
 
 def _size_and_time(path: Path) -> list[int] | None:
@@ -326,6 +412,7 @@ def _columns(index: FrameIndex) -> dict[str, list[pa.Array]]:
             index.recording,
             pa.array(index.sweep),
             _lists(images.offsets, pa.StructArray.from_arrays(image_fields, fields=list(_IMAGE))),
+            pa.array(boxes.annotated.view(np.uint8)),
             _lists(boxes.offsets, pa.StructArray.from_arrays(box_fields, fields=list(_BOX))),
         ],
     }
@@ -380,6 +467,7 @@ def _from_batches(batches: dict[str, pa.RecordBatch]) -> FrameIndex:
             pose=_matrix(boxes.values.field("pose")),
             size_lwh=_matrix(boxes.values.field("size_lwh")),
             offsets=_numbers(boxes.offsets),
+            annotated=_numbers(frames.column("annotated")).view(np.bool_),
         ),
     )
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""Semantic pseudo labels of images: hard class maps and per-pixel probabilities.
+"""Semantic pseudo labels of images: hard class maps, per-pixel probabilities, and probabilities at some pixels.
 
 A label map may be smaller or larger than its image (segmenters often run on a scaled copy); image
 pixels are scaled to it. It must show the whole image, so its aspect ratio must be the image's.
@@ -19,10 +19,13 @@ from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 from PIL import Image
 
+from pred.data import soft_labels
 from pred.data.frame import NUM_CLASSES, FrameError, open_image
+from pred.data.soft_labels import SoftLabels
 
 IGNORED_CLASS_IDS = (19, 255)
 PROBABILITIES_KEY = "probabilities"
+SOFT_KEYS = (soft_labels.SHAPE, soft_labels.STEPS, soft_labels.CODES)
 LABEL_SUFFIXES = (".png", ".npy", ".npz")
 MAX_PROBABILITY_SUM = 1.01  # room for float16 rounding
 
@@ -47,7 +50,8 @@ class PseudoLabel:
 
     Attributes:
         source: ``.png`` (palette or grey, Cityscapes train ids; 19 and 255 are ignored), ``.npy``
-            or ``.npz`` (key ``probabilities``; float16 or float32 [19, h, w]); or such an array,
+            or ``.npz`` (key ``probabilities``; float16 or float32 [19, h, w]; or the keys of
+            `pred.data.soft_labels`: cells that are not stored are ignored); or such an array,
             uint8 [h, w] class ids or [19, h, w] probabilities, or a function that makes it.
         width, height: size of the image in pixels.
     """
@@ -71,11 +75,9 @@ class PseudoLabel:
                 holds other class ids, or values that are no probabilities.
         """
         label_map = self._load()
-        map_height, map_width = label_map.shape[-2:]
-        column = np.floor(uv[:, 0] * (map_width / self.width)).astype(np.int64)
-        row = np.floor(uv[:, 1] * (map_height / self.height)).astype(np.int64)
-        column = column.clip(0, map_width - 1)
-        row = row.clip(0, map_height - 1)
+        row, column = label_cells(uv, (self.height, self.width), label_map.shape[-2:])
+        if isinstance(label_map, SoftLabels):
+            return self._soft_lookup(label_map.at(row, column).T)
         if label_map.ndim == 2:
             return _hard_lookup(label_map[row, column])
         return self._soft_lookup(label_map[:, row, column])
@@ -83,13 +85,18 @@ class PseudoLabel:
     def class_map(self) -> NDArray[np.uint8]:
         """[h, w] most probable class of every label cell, 255 where ignored; raises as `lookup`."""
         label_map = self._load()
+        if isinstance(label_map, SoftLabels):
+            class_map = np.full(label_map.shape, 255, dtype=np.uint8)
+            class_map.flat[label_map.cells] = soft_labels.decode(label_map.codes).argmax(axis=1)
+            return class_map
         if label_map.ndim == 2:
             return np.where(label_map < NUM_CLASSES, label_map, 255).astype(np.uint8)
         looked_up = self._soft_lookup(label_map.reshape(NUM_CLASSES, -1))
         class_id = np.where(looked_up.class_id < 0, 255, looked_up.class_id)
         return class_id.astype(np.uint8).reshape(label_map.shape[1:])
 
-    def _load(self) -> NDArray[Any]:
+    def _load(self) -> NDArray[Any] | SoftLabels:
+        label_map: NDArray[Any] | SoftLabels
         if not isinstance(self.source, Path):
             label_map = np.asarray(self.source() if callable(self.source) else self.source)
         elif self.source.suffix == ".png":
@@ -97,7 +104,9 @@ class PseudoLabel:
         elif self.source.suffix == ".npy":
             label_map = _map_npy(self.source)
         elif self.source.suffix == ".npz":
-            label_map = _read_npz(self.source, self._check_header)
+            label_map = _read_npz(self.source, self._check_header, self._check_grid)
+            if isinstance(label_map, SoftLabels):
+                return label_map
         else:
             raise FrameError(self.source, f"label must be one of {LABEL_SUFFIXES}")
         self._check_header(label_map.shape, label_map.dtype)
@@ -114,7 +123,12 @@ class PseudoLabel:
                 "label must be uint8 [h, w] class ids or float16/float32 "
                 f"[{NUM_CLASSES}, h, w] probabilities, got {dtype} {list(shape)}",
             )
-        map_height, map_width = shape[-2:]
+        self._check_grid(shape[-2:])
+
+    def _check_grid(self, shape: tuple[int, ...]) -> None:
+        map_height, map_width = shape
+        if map_height < 1 or map_width < 1:
+            raise FrameError(self.name, f"label must have at least 1 x 1 cells, got {list(shape)}")
         max_pixels = Image.MAX_IMAGE_PIXELS
         if max_pixels is not None and map_height * map_width > max_pixels:
             raise FrameError(self.name, f"label must have at most {max_pixels} pixels, got {list(shape)}")
@@ -151,6 +165,20 @@ class PseudoLabel:
         confidence = target.max(axis=1, initial=0.0)
         class_id = np.where(confidence > 0, target.argmax(axis=1), -1)
         return LabelLookup(target, confidence, class_id)
+
+
+def label_cells(
+    uv: NDArray[np.float64], image_shape: tuple[int, int], map_shape: tuple[int, ...]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Row [N] and column [N] of the label cells that hold image pixels ``uv`` [N, 2]; pixels outside are clamped.
+
+    Shapes are (rows, columns) of the image and of the label map.
+    """
+    row, column = (
+        np.floor(uv[:, axis] * (map_shape[side] / image_shape[side])).astype(np.int64).clip(0, map_shape[side] - 1)
+        for side, axis in ((0, 1), (1, 0))
+    )
+    return row, column
 
 
 def label_folder(root: Path, labels: str | None) -> Path | None:
@@ -218,17 +246,21 @@ def _map_npy(path: Path) -> NDArray[Any]:
         raise FrameError(path, _unreadable(".npy", error)) from None
 
 
-def _read_npz(path: Path, check_header: Callable[[tuple[int, ...], np.dtype[Any]], None]) -> NDArray[Any]:
-    member = f"{PROBABILITIES_KEY}.npy"
+def _read_npz(
+    path: Path,
+    check_header: Callable[[tuple[int, ...], np.dtype[Any]], None],
+    check_grid: Callable[[tuple[int, ...]], None],
+) -> NDArray[Any] | SoftLabels:
     try:
         with zipfile.ZipFile(path) as archive:
-            if member not in archive.namelist():
-                raise FrameError(path, f"must hold the key {PROBABILITIES_KEY!r}, got {archive.namelist()}")
-            # The claimed size is checked before anything is allocated for it.
-            with archive.open(member) as stream:
-                check_header(*_npy_header(stream))
-            with archive.open(member) as stream:
-                return npy_format.read_array(stream, allow_pickle=False)
+            held = archive.namelist()
+            if f"{PROBABILITIES_KEY}.npy" in held:
+                # Claimed sizes are checked before anything is allocated for them.
+                check_header(*_header(archive, PROBABILITIES_KEY))
+                return _array(archive, PROBABILITIES_KEY)
+            if not {f"{key}.npy" for key in SOFT_KEYS} <= set(held):
+                raise FrameError(path, f"must hold the key {PROBABILITIES_KEY!r} or {', '.join(SOFT_KEYS)}, got {held}")
+            return _read_soft(path, archive, check_grid)
     except FrameError:
         raise
     except FileNotFoundError:
@@ -236,6 +268,45 @@ def _read_npz(path: Path, check_header: Callable[[tuple[int, ...], np.dtype[Any]
     # Damage surfaces as BadZipFile, zlib.error, ValueError, OSError, EOFError, ...
     except Exception as error:
         raise FrameError(path, _unreadable(".npz", error)) from None
+
+
+def _read_soft(path: Path, archive: zipfile.ZipFile, check_grid: Callable[[tuple[int, ...]], None]) -> SoftLabels:
+    headers = {key: _header(archive, key) for key in SOFT_KEYS}
+    num_cells = headers[soft_labels.STEPS][0]
+    if headers[soft_labels.SHAPE] != ((2,), np.int32):
+        raise FrameError(path, f"{soft_labels.SHAPE} must be int32 [2], got {_described(headers[soft_labels.SHAPE])}")
+    shape = _array(archive, soft_labels.SHAPE)
+    check_grid(tuple(map(int, shape)))
+    for key, dtype, wanted in (
+        (soft_labels.STEPS, np.uint32, num_cells),
+        (soft_labels.CODES, np.uint8, (NUM_CLASSES, *num_cells)),
+    ):
+        if headers[key] != (wanted, dtype) or len(num_cells) != 1 or num_cells[0] > int(shape[0]) * int(shape[1]):
+            raise FrameError(
+                path,
+                f"{key} must be {np.dtype(dtype)} of [{'19, ' if key == soft_labels.CODES else ''}N] for N cells of a "
+                f"grid of {shape[0]} x {shape[1]}, got {_described(headers[key])}",
+            )
+    try:
+        return soft_labels.from_arrays(shape, _array(archive, soft_labels.STEPS), _array(archive, soft_labels.CODES))
+    except ValueError as error:
+        raise FrameError(path, f"label is damaged: {error}") from None
+
+
+def _header(archive: zipfile.ZipFile, key: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    with archive.open(f"{key}.npy") as stream:
+        return _npy_header(stream)
+
+
+def _array(archive: zipfile.ZipFile, key: str) -> NDArray[Any]:
+    with archive.open(f"{key}.npy") as stream:
+        array: NDArray[Any] = npy_format.read_array(stream, allow_pickle=False)
+        stream.read()  # to the end, where the checksum is compared
+        return array
+
+
+def _described(header: tuple[tuple[int, ...], np.dtype[Any]]) -> str:
+    return f"{header[1]} {list(header[0])}"
 
 
 def _npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:

@@ -25,7 +25,6 @@ from pred.data.frame import (
     FrameError,
     check_image_header,
     invert_rigid,
-    pose_matrix,
     require_inside,
     require_intrinsics,
     transform_points,
@@ -36,22 +35,24 @@ from pred.data.index import (
     FrameIndex,
     Images,
     IndexedBoxes,
+    IndexedFrames,
     Readings,
     Sweeps,
     number_lists,
     offsets_of,
     open_index,
+    rigid,
     strings,
 )
 from pred.data.info_files import load_info
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
 from pred.data.lidarseg import NO_CLASS, class_files, class_ids_of_categories, read_point_classes
-from pred.data.sweeps import Accumulated, Sweep, accumulate, require_finite_points
-from pred.data.tables import Report, Row, raise_problem, read_json, read_table
-from pred.progress import Progress
+from pred.data.sweeps import Accumulated, Sweep, accumulate, check_points_size, read_points, require_finite_points
+from pred.data.tables import Report, Row, raise_problem, read_json, read_table, reading_progress
 
 LIDAR_CHANNEL = "LIDAR_TOP"
-BYTES_PER_POINT = 20  # float32 x, y, z, intensity, ring
+SWEEP_COLUMNS = ("x", "y", "z", "intensity", "ring")
+MISSING_SWEEP_HINT = " (without sweeps/: data.sweeps 1)"
 MICROSECONDS = 1e-6
 
 TABLES = (
@@ -63,11 +64,8 @@ TABLES = (
 MAX_INFO_OFFSET_M = 0.05
 """Box centres of info files, some of them float32, differ by millimetres from those of the tables."""
 
-PROGRESS_BYTES = 50_000_000
-"""Tables of at most so many bytes are read without a progress display."""
 
-
-class NuScenesFrames:
+class NuScenesFrames(IndexedFrames):
     """Keyframes of a nuScenes-like data set as a `FrameSource`.
 
     Args:
@@ -119,13 +117,6 @@ class NuScenesFrames:
         self._index = self._open_index()
         self._rows = self._select(split) if info is None else self._select_infos(Path(info))
 
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def token(self, index: int) -> str:
-        """Sample token of frame ``index``."""
-        return str(self._index.token[self._rows[index]])
-
     def load(self, index: int) -> Frame:
         """Read the sweeps of keyframe ``index``. With labels, images are checked by their headers
         and labels to exist; without, images may be missing.
@@ -133,8 +124,8 @@ class NuScenesFrames:
         Raises:
             FrameError: a file is missing, truncated, of the wrong type or size, or holds NaN or Inf.
         """
-        row = int(self._rows[index])
-        token = self.token(index)
+        row = self._row(index)
+        token = str(self._index.token[row])
         keyframe = int(self._index.sweep[row])
         if keyframe < 0:
             raise no_keyframe(self.tables, token)
@@ -150,14 +141,6 @@ class NuScenesFrames:
             semantics=None if self._class_files is None else self._point_classes(keyframe, sweeps, self._class_files),
             boxes=self._boxes(row, T_world_from_lidar),
         )
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_index"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """In another process the file is opened again, instead of sending its content there."""
-        vars(self).update(state)
-        self._index = self._open_index()
 
     def _open_index(self) -> FrameIndex:
         sources = [self.tables / f"{name}.json" for name in TABLES]
@@ -197,13 +180,10 @@ class NuScenesFrames:
                 f"got box {worst} {distance_m[worst]:.2f} m away from the nearest",
             )
 
-    def _file(self, readings: Readings, row: int) -> Path:
-        return self.root / str(readings.path[row])
-
     def _sensor_pose(self, readings: Readings, row: int) -> NDArray[np.float64]:
         """T_world_from_sensor at the time of the measurement."""
-        T_world_from_ego = _rigid(self._index.poses[readings.pose[row]])
-        return T_world_from_ego @ _rigid(self._index.calibrations.pose[readings.calibration[row]])
+        T_world_from_ego = rigid(self._index.poses[readings.pose[row]])
+        return T_world_from_ego @ rigid(self._index.calibrations.pose[readings.calibration[row]])
 
     def _sweeps(self, keyframe: int, T_world_from_lidar: NDArray[np.float64]) -> Iterator[Sweep]:
         """The keyframe's own sweep and those before it."""
@@ -229,7 +209,7 @@ class NuScenesFrames:
         sweep_file = str(self._index.sweeps.path[keyframe])
         if sweep_file not in files:
             raise FrameError(self.tables / "lidarseg.json", f"table must have a row for {sweep_file}, got none")
-        num_points = self._file(self._index.sweeps, keyframe).stat().st_size // BYTES_PER_POINT
+        num_points = self._file(self._index.sweeps, keyframe).stat().st_size // (4 * len(SWEEP_COLUMNS))
         classes = read_point_classes(self.root / files[sweep_file], num_points, self._class_ids)
         semantics = np.full(len(sweeps.points), NO_CLASS, dtype=np.int64)
         semantics[sweeps.is_keyframe] = classes[sweeps.point_index[sweeps.is_keyframe]]
@@ -261,7 +241,7 @@ class NuScenesFrames:
         boxes = self._index.boxes
         rows = slice(*boxes.offsets[row : row + 2].tolist())
         T_lidar_from_world = invert_rigid(T_world_from_lidar)
-        poses = [T_lidar_from_world @ _rigid(pose) for pose in boxes.pose[rows]]
+        poses = [T_lidar_from_world @ rigid(pose) for pose in boxes.pose[rows]]
         T_lidar_from_box = np.stack(poses) if poses else np.zeros((0, 4, 4))
         return Boxes(
             centre_m=T_lidar_from_box[:, :3, 3],
@@ -292,16 +272,7 @@ def build_index(tables: Path, report: Report = raise_problem) -> FrameIndex:
         tables: folder with the JSON tables.
         report: gets each problem as a `FrameError`; if it returns, the rows concerned are left out.
     """
-    num_bytes = sum(path.stat().st_size for name in TABLES if (path := tables / f"{name}.json").is_file())
-    large = num_bytes > PROGRESS_BYTES
-    with Progress(f"indexing {tables.name}, MB", max(1, num_bytes // 1_000_000), enabled=large) as progress:
-        done = 0
-
-        def advance(characters: int) -> None:
-            nonlocal done
-            done += characters
-            progress.update(min(done, num_bytes) // 1_000_000)
-
+    with reading_progress(f"indexing {tables.name}", [tables / f"{name}.json" for name in TABLES]) as advance:
         return _build_index(_Reader(tables, report, advance))
 
 
@@ -495,6 +466,7 @@ def _read_boxes(read: _Reader, frame_rows: dict[str, int]) -> IndexedBoxes:
         pose=columns[:, :7],
         size_lwh=columns[:, 7:],
         offsets=offsets_of(frame, len(frame_rows)),
+        annotated=np.ones(len(frame_rows), dtype=np.bool_),
     )
 
 
@@ -508,37 +480,14 @@ def no_keyframe(tables: Path, token: str) -> FrameError:
 
 def read_sweep(path: Path) -> NDArray[np.float32]:
     """[N, 5] float32: x, y, z, intensity, ring."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise _unreadable_sweep(path, error) from None
-    _require_whole_points(path, len(content))
-    points = np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(-1, 5)
+    points = read_points(path, SWEEP_COLUMNS, "sweep file", MISSING_SWEEP_HINT).astype(np.float32)
     require_finite_points(path, points)
     return points
 
 
 def check_sweep_size(path: Path) -> None:
     """Check the size of a sweep file without reading it; raises as `read_sweep`."""
-    try:
-        _require_whole_points(path, path.stat().st_size)
-    except OSError as error:
-        raise _unreadable_sweep(path, error) from None
-
-
-def _require_whole_points(path: Path, num_bytes: int) -> None:
-    if num_bytes == 0 or num_bytes % BYTES_PER_POINT:
-        raise FrameError(
-            path,
-            f"sweep must hold whole points of {BYTES_PER_POINT} bytes (float32 x, y, z, intensity, "
-            f"ring), got {num_bytes} bytes: truncated?",
-        )
-
-
-def _unreadable_sweep(path: Path, error: OSError) -> FrameError:
-    if isinstance(error, FileNotFoundError):
-        return FrameError(path, "sweep file must exist, got no such file (without sweeps/: data.sweeps 1)")
-    return FrameError(path, f"sweep file must be readable, got {error}")
+    check_points_size(path, SWEEP_COLUMNS, "sweep file", MISSING_SWEEP_HINT)
 
 
 def _add_row(rows: dict[str, int], token: Any) -> None:
@@ -563,11 +512,6 @@ def _pose(row: Row) -> list[float]:
     if abs(math.hypot(*pose[3:]) - 1.0) > 1e-2:
         raise ValueError(f"rotation {rotation}, which is not a unit quaternion")
     return pose
-
-
-def _rigid(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[4, 4] matrix of a row of poses."""
-    return pose_matrix(pose[:3], pose[3:])
 
 
 def only_table_folder(root: Path) -> Path:

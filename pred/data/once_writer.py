@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from pred.data.frame import (
     quaternion_of,
     transform_points,
 )
-from pred.data.once import CAMERAS, CLASSES, LIDAR
+from pred.data.once import CAMERAS, CLASSES, LIDAR, PIXEL_CENTRE
 
 JPEG_QUALITY = 95
 CALIBRATION_TOLERANCE = 1e-6
@@ -213,7 +213,7 @@ def _write_frames(folder: Path, sequence: str, records: Iterable[OnceRecord], jp
     calib = {
         name: {
             "cam_to_velo": invert_rigid(camera.T_camera_from_lidar).tolist(),
-            "cam_intrinsic": camera.intrinsics.tolist(),
+            "cam_intrinsic": (camera.intrinsics - PIXEL_CENTRE).tolist(),
             "distortion": [0.0] * 5,
         }
         for name, camera in sorted(calibrations.items())
@@ -268,7 +268,7 @@ def _annotation(boxes: Boxes, cameras: Sequence[Camera]) -> dict[str, Any]:
     rows = np.concatenate([boxes.centre_m, boxes.size_m, boxes.yaw_rad[:, None]], axis=1)
     boxes_2d = {name: np.full((len(rows), 4), -1.0) for name in CAMERAS}
     for camera in cameras:
-        boxes_2d[camera.name] = boxes_in_image(rows, camera)
+        boxes_2d[camera.name] = boxes_in_image(rows, replace(camera, intrinsics=camera.intrinsics - PIXEL_CENTRE))
     return {
         "names": list(boxes.names),
         "boxes_3d": rows.tolist(),

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pred.data.frame import FrameError
+from pred.data.frame import FrameError, unreadable
 
 MAX_HEADER_BYTES = 1 << 16
 MAX_POINTS = 1 << 28
@@ -53,7 +53,7 @@ def read_pcd(path: Path) -> NDArray[Any]:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise _unreadable(path, error) from None
+        raise unreadable(path, error, "scan") from None
     header = parse_header(path, content)
     body = content[header.size :]
     if header.data == "ascii":
@@ -76,7 +76,7 @@ def read_pcd_header(path: Path) -> PcdHeader:
             start = file.read(8)
         size = path.stat().st_size - header.size
     except OSError as error:
-        raise _unreadable(path, error) from None
+        raise unreadable(path, error, "scan") from None
     if header.data == "binary":
         _require_bytes(path, header.num_points * header.dtype.itemsize, size)
     elif header.data == "binary_compressed":
@@ -223,12 +223,6 @@ def decompress_lzf(data: bytes, num_bytes: int) -> bytes:
 def _require_bytes(path: Path, needed: int, size: int) -> None:
     if size < needed:
         raise _damaged(path, f"must hold {needed} bytes of points, got {size}: truncated?")
-
-
-def _unreadable(path: Path, error: OSError) -> FrameError:
-    if isinstance(error, FileNotFoundError):
-        return FrameError(path, "scan must exist, got no such file")
-    return FrameError(path, f"scan must be readable, got {error}")
 
 
 def _damaged(path: Path, what: str) -> FrameError:

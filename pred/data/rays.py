@@ -55,6 +55,7 @@ class SemanticCandidates(NamedTuple):
     Attributes:
         origins: [N, 3] float32, the camera centre (in the LiDAR view the LiDAR), metres.
         directions: [N, 3] float32, unit length, through the LiDAR return.
+        range_m: [N] float32, distance from the origin to the return.
         target: [N, 19] float32 class probabilities.
         confidence: [N] float32, the largest probability.
         class_id: [N] int64 in 0..18.
@@ -62,6 +63,7 @@ class SemanticCandidates(NamedTuple):
 
     origins: NDArray[np.float32]
     directions: NDArray[np.float32]
+    range_m: NDArray[np.float32]
     target: NDArray[np.float32]
     confidence: NDArray[np.float32]
     class_id: NDArray[np.int64]
@@ -217,6 +219,7 @@ def _semantic(
     return SemanticCandidates(
         origins=np.broadcast_to(origin.astype(np.float32), (num_rays, 3)),
         directions=directions[seen[labelled]].astype(np.float32),
+        range_m=distance_m[seen[labelled]].astype(np.float32),
         target=labels.target[labelled],
         confidence=labels.confidence[labelled],
         class_id=labels.class_id[labelled],
@@ -243,6 +246,7 @@ def join_cameras(cameras: list[SemanticCandidates]) -> SemanticCandidates:
     none = SemanticCandidates(
         origins=np.zeros((0, 3), dtype=np.float32),
         directions=np.zeros((0, 3), dtype=np.float32),
+        range_m=np.zeros(0, dtype=np.float32),
         target=np.zeros((0, NUM_CLASSES), dtype=np.float32),
         confidence=np.zeros(0, dtype=np.float32),
         class_id=np.zeros(0, dtype=np.int64),

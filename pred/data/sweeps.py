@@ -4,14 +4,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pred.data.frame import FrameError, outside_ego_box, transform_points
+from pred.data.frame import FrameError, outside_ego_box, transform_points, unreadable
 
 try:
     from pred import _host
@@ -59,6 +59,43 @@ def place_sweep_reference(
     placed[:, 3] = points[kept, 3]
     placed[:, 4] = lag_s
     return placed, kept
+
+
+def read_points(path: Path, columns: Sequence[str], what: str = "scan", hint: str = "") -> NDArray[np.float32]:
+    """[N, columns] of a file of float32 numbers, point after point.
+
+    Args:
+        path: the file.
+        columns: names of the values of a point.
+        what: names the file in error texts.
+        hint: what to do if it is missing.
+
+    Raises:
+        FrameError: the file is missing, unreadable, empty or truncated.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise unreadable(path, error, what, hint) from None
+    _require_whole_points(path, len(content), columns, what)
+    return np.frombuffer(content, dtype="<f4").reshape(-1, len(columns))
+
+
+def check_points_size(path: Path, columns: Sequence[str], what: str = "scan", hint: str = "") -> None:
+    """Check the size of a file of points without reading it; arguments and errors of `read_points`."""
+    try:
+        num_bytes = path.stat().st_size
+    except OSError as error:
+        raise unreadable(path, error, what, hint) from None
+    _require_whole_points(path, num_bytes, columns, what)
+
+
+def _require_whole_points(path: Path, num_bytes: int, columns: Sequence[str], what: str) -> None:
+    point = 4 * len(columns)
+    if num_bytes == 0 or num_bytes % point:
+        names = ", ".join(columns)
+        rule = f"{what} must hold whole points of {point} bytes (float32 {names})"
+        raise FrameError(path, f"{rule}, got {num_bytes} bytes: truncated?")
 
 
 def require_finite_points(path: Path, points: NDArray[np.float32]) -> None:

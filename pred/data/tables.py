@@ -6,11 +6,16 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pred.data.frame import FrameError
+from pred.data.frame import FrameError, unreadable
+from pred.progress import Progress
+
+PROGRESS_BYTES = 50_000_000
+"""Files of at most so many bytes together are read without a progress display."""
 
 CHUNK_CHARACTERS = 1 << 22
 """Read at once; no row may be longer."""
@@ -25,6 +30,22 @@ _SPACE = re.compile(r"[ \t\n\r]*")
 def raise_problem(problem: FrameError) -> None:
     """A `Report` that stops at the first problem."""
     raise problem
+
+
+@contextmanager
+def reading_progress(description: str, paths: Iterable[Path]) -> Iterator[Callable[[int], None]]:
+    """Shows how much of some files is read, if they are large; gives a function that is told the size of each piece."""
+    num_bytes = sum(path.stat().st_size for path in paths if path.is_file())
+    total = max(1, num_bytes // 1_000_000)
+    with Progress(f"{description}, MB", total, enabled=num_bytes > PROGRESS_BYTES) as progress:
+        done = 0
+
+        def advance(size: int) -> None:
+            nonlocal done
+            done += size
+            progress.update(min(done, num_bytes) // 1_000_000)
+
+        yield advance
 
 
 def read_table(
@@ -75,7 +96,7 @@ def read_json(path: Path, what: str = "table") -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise _unreadable(path, error, what) from None
+        raise unreadable(path, error, what) from None
     except (ValueError, RecursionError) as error:
         raise _no_json(path, error, what) from None
 
@@ -90,7 +111,7 @@ def iterate_rows(path: Path, advance: Callable[[int], None] | None = None) -> It
         with open(path, encoding="utf-8") as file:
             yield from _rows(path, file.read, advance)
     except OSError as error:
-        raise _unreadable(path, error) from None
+        raise unreadable(path, error, "table") from None
     except UnicodeDecodeError as error:
         raise _no_json(path, error) from None
 
@@ -157,12 +178,6 @@ def _rows(path: Path, read: Callable[[int], str], advance: Callable[[int], None]
         position += 1
     if peek():
         raise broken("Extra data", dropped + position)
-
-
-def _unreadable(path: Path, error: OSError, what: str = "table") -> FrameError:
-    if isinstance(error, FileNotFoundError):
-        return FrameError(path, f"{what} must exist, got no such file")
-    return FrameError(path, f"{what} must be readable, got {error}")
 
 
 def _reason(error: ValueError | RecursionError) -> str:

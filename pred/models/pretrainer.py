@@ -153,11 +153,24 @@ class Pretrainer(nn.Module):
     ) -> Iterator[Tensor]:
         """Weighted loss of each part of the semantic rays; adds its figures to `totals`."""
         for frame, rays, share in self._parts(semantic_rays, totals):
-            rendered = self._render_rays(frames[frame], inv_s, rays, semantics=True, detach_sdf=True)
-            assert rendered.semantics is not None
-            semantic = share * semantic_loss(rendered.semantics, rays.target, rays.confidence, rendered.hit)
+            if self.loss_config.semantic_at == "ray":
+                rendered = self._render_rays(frames[frame], inv_s, rays, semantics=True, detach_sdf=True)
+                semantics, hit = rendered.semantics, rendered.hit
+            else:
+                semantics, hit = self._decode_returns(frames[frame], rays)
+            assert semantics is not None
+            semantic = share * semantic_loss(semantics, rays.target, rays.confidence, hit)
             totals["semantic"] += semantic.detach()
             yield self.loss_config.semantic_weight * semantic
+
+    def _decode_returns(self, projected: Tensor, rays: SemanticRays) -> tuple[Tensor, Tensor]:
+        """Class probabilities `[1, r, K]` at the rays' returns, and which count `[1, r]`."""
+        hit = self.renderer.hits(rays.origins, rays.directions, rays.valid)
+        # Rays that do not count may hold NaN, which would reach the weights' gradients.
+        returns = torch.where(hit[..., None], rays.origins + rays.directions * rays.range_m[..., None], 0.0)
+        logits = self.field.decode(projected, returns).semantics
+        assert logits is not None
+        return logits.softmax(-1), hit
 
     def _parts(self, rays: RaysT, totals: dict[str, Tensor]) -> Iterator[tuple[int, RaysT, Tensor]]:
         """Splits rays: (frame, rays `[1, r]`, share of the valid rays of the whole batch)."""

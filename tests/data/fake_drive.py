@@ -82,7 +82,7 @@ def _town() -> dict[str, list[NDArray[np.float64]]]:
 
     return {
         "drivable_area": [rectangle(-60, -60, 60, 60), rectangle(60, -10, 120, 10)],
-        "road_segment": [rectangle(60, -10, 120, 10)],
+        "road_segment": [rectangle(-10, -10, 10, 10), rectangle(60, -10, 120, 10)],
         "road_block": [rectangle(60, -10, 120, 0)],
         "lane": [rectangle(60, -10, 120, -5), rectangle(60, -5, 120, 0)],
         "ped_crossing": [rectangle(60, -10, 64, 10)],
@@ -101,6 +101,7 @@ class FakeTown:
             "lane_divider": [np.array([[60.0, -5.0], [90.0, -5.0], [120.0, -5.0]])],
         }
     )
+    intersections: list[NDArray[np.float64]] = field(default_factory=lambda: _town()["road_segment"][:1])
 
 
 class FakeDrive:

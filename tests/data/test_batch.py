@@ -430,9 +430,9 @@ def test_broken_frame_stops_the_loader_with_its_text(tree: Tree) -> None:
     for workers in (0, 1):
         with pytest.raises(FrameError) as error:
             list(make_loader(TrainingBatches(tree_config(tree), POINT_RANGE, 0, 2), workers=workers))
-        assert str(error.value).startswith(f"{path}: sweep must hold whole points of 20 bytes")
+        assert str(error.value).startswith(f"{path}: sweep file must hold whole points of 20 bytes")
         assert "\n" not in str(error.value)  # no traceback of a loader process
-        with pytest.raises(FrameError, match=rf"^{path}: sweep must hold whole points of 20 bytes"):
+        with pytest.raises(FrameError, match=rf"^{path}: sweep file must hold whole points of 20 bytes"):
             config = tree_config(tree, class_counts="dataset", workers=workers)
             TrainingBatches(config, POINT_RANGE, 0, 2)
 

@@ -10,6 +10,8 @@ import multiprocessing
 import os
 import pickle
 import signal
+import warnings
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -87,7 +89,9 @@ def test_any_arrow_library_reads_the_file(tree: Tree) -> None:
     NuScenesFrames(tree.root)
     with pa.memory_map(str(tree.tables / FILE_NAME)) as source:
         streams = {name: pa.ipc.open_stream(source).read_all() for name in SCHEMAS}
-        assert source.tell() == source.size()
+        assert source.tell() == source.size() - 4
+        content = (tree.tables / FILE_NAME).read_bytes()
+        assert int.from_bytes(content[-4:], "little") == zlib.crc32(content[:-4])
     header = json.loads(streams["calibrations"].schema.metadata[b"pred_index"])
     assert header["version"] == FORMAT_VERSION
     table = tree.tables / "sample_data.json"
@@ -153,24 +157,59 @@ def test_a_moved_root_keeps_its_index(tree: Tree, builds: list[Path]) -> None:
     assert len(builds) == 1 and frame.source.startswith(str(moved))
 
 
-@pytest.mark.parametrize("damage", ["empty", "short", "tail", "text", "version", "schema"])
-def test_damaged_and_other_files_are_made_anew(tree: Tree, builds: list[Path], damage: str) -> None:
-    NuScenesFrames(tree.root)
+@pytest.mark.parametrize("damage", ["empty", "shorter than the checksum", "short", "tail", "text", "longer", "header"])
+def test_damaged_files_are_made_anew(tree: Tree, builds: list[Path], damage: str) -> None:
+    before = NuScenesFrames(tree.root).load(0)
     path = tree.tables / FILE_NAME
     content = path.read_bytes()
-    if damage == "schema":
-        content = content.replace(b"recording", b"recordinX")
     changed = {
         "empty": b"",
+        "shorter than the checksum": b"xy",
         "short": content[:100],
         "tail": content[:-900],
         "text": b"something else",
-        "version": content.replace(b'"version": 1', b'"version": 0'),
-    }.get(damage, content)
-    path.write_bytes(changed)
+        "longer": content + b"\0",
+        "header": content.replace(b'"sources"', b'"sources '),
+    }
+    path.write_bytes(changed[damage])
+    with pytest.warns(UserWarning, match=rf"{path}: index must be intact, got .*; it is made anew"):
+        after = NuScenesFrames(tree.root).load(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        NuScenesFrames(tree.root)
+    assert len(builds) == 2 and path.read_bytes() == content
+    assert np.array_equal(after.T_world_from_lidar, before.T_world_from_lidar)
+
+
+def test_a_file_of_another_version_is_made_anew(tree: Tree, builds: list[Path]) -> None:
     NuScenesFrames(tree.root)
-    NuScenesFrames(tree.root)
-    assert len(builds) == 2
+    path = tree.tables / FILE_NAME
+    content = path.read_bytes()
+    number = f'"version": {FORMAT_VERSION}'.encode()
+    path.write_bytes(content.replace(number, b'"version": 0'))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        NuScenesFrames(tree.root)
+    assert len(builds) == 2 and path.read_bytes() == content
+
+
+def test_no_changed_bit_is_trusted(tree: Tree, tmp_path: Path) -> None:
+    """Wherever it is: in numbers, texts, offsets, the structure or the checksum itself."""
+    path = tmp_path / "file.arrow"
+    stamp = {"table.json": [3, 4]}
+    write_index(path, build_index(tree.tables), stamp)
+    content = bytearray(path.read_bytes())
+    number = np.float64(build_index(tree.tables).poses[0, 0]).tobytes()
+    places = [content.index(number) + 6, *range(0, len(content), 37), *range(len(content) - 4, len(content))]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for place in places:
+            content[place] ^= 0x10
+            path.write_bytes(content)
+            assert read_index(path, stamp) is None, place
+            content[place] ^= 0x10
+    path.write_bytes(content)
+    assert read_index(path, stamp) is not None
 
 
 @pytest.mark.parametrize("column", ["token", "path"])
@@ -187,7 +226,8 @@ def test_texts_that_reach_outside_of_the_file(tree: Tree, tmp_path: Path, column
         buffers = pa.py_buffer(offsets.copy()), pa.py_buffer(b"x" * len(texts))
         setattr(owner, column, pa.StringArray.from_buffers(len(texts), *buffers))
         write_index(tmp_path / "bad.arrow", built, {})
-        assert read_index(tmp_path / "bad.arrow", {}) is None
+        with pytest.warns(UserWarning, match="index must be intact"):
+            assert read_index(tmp_path / "bad.arrow", {}) is None
 
 
 @contextmanager

@@ -176,12 +176,12 @@ def test_truncated_sweep(tree: Tree) -> None:
     path.write_bytes(path.read_bytes()[:-7])
     size = path.stat().st_size
     text = broken_text(tree)
-    assert text.startswith(f"{path}: sweep must hold whole points of 20 bytes")
+    assert text.startswith(f"{path}: sweep file must hold whole points of 20 bytes")
     assert text.endswith(f"got {size} bytes: truncated?")
     # The other keyframe does not use it.
     NuScenesFrames(tree.root).load(0)
     path.write_bytes(b"")
-    assert f"{path}: sweep must hold whole points" in broken_text(tree)
+    assert f"{path}: sweep file must hold whole points" in broken_text(tree)
 
 
 def test_missing_sweep(tree: Tree) -> None:

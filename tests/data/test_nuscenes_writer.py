@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import multiprocessing
@@ -35,6 +36,7 @@ from pred.data.world.nuscenes_writer import (
     WorldSettings,
     _Picture,
     _visible_shares,
+    encode_depth,
     make_token,
 )
 from pred.data.world.sensors import CALIBRATED_MOUNTS, T_EGO_FROM_LIDAR, mounted_camera
@@ -90,7 +92,7 @@ def tree(root: Path) -> dict[str, str]:
 
 def test_files(root: Path) -> None:
     assert {path.name for path in root.iterdir()} == {
-        "world.json", "v1.0-world", "samples", "sweeps", "maps", "lidarseg", "pseudo",
+        "world.json", "v1.0-world", "samples", "sweeps", "maps", "lidarseg", "pseudo", "depth",
     }  # fmt: skip
     keyframes = SCENES * KEYFRAMES
     counts = {
@@ -100,6 +102,7 @@ def test_files(root: Path) -> None:
         "sweeps/CAM_*/*.jpg": 0,
         "lidarseg/v1.0-world/*_lidarseg.bin": keyframes,
         "pseudo/exact/CAM_*/*.png": 6 * keyframes,
+        "depth/exact/CAM_*/*.png": 6 * keyframes,
         "maps/expansion/*.json": 4,
         "maps/*.png": SCENES,
         "v1.0-world/*.json": 15,
@@ -116,6 +119,17 @@ def test_files(root: Path) -> None:
         assert (label.size, label.mode) == ((WIDTH, HEIGHT), "L")
         view = FakeDrive(SEED, 0).view(CALIBRATED_MOUNTS[0], int(first) - 35_000, WIDTH, HEIGHT)
         np.testing.assert_array_equal(np.asarray(label), view.class_id)
+    with Image.open(root / "depth" / "exact" / "CAM_FRONT" / f"{image.stem}.png") as depth:
+        assert (depth.size, depth.mode) == ((WIDTH, HEIGHT), "I;16")
+        np.testing.assert_array_equal(np.asarray(depth), encode_depth(view.depth_m))
+
+
+def test_depth_is_stored_as_in_the_kitti_benchmark() -> None:
+    """256 steps a metre; none for the sky and beyond 255 m."""
+    depth_m = np.array([[1.0, 2.5 / 256, 254.9999, 255.0, 255.01, np.inf]], dtype=np.float32)
+    encoded = encode_depth(depth_m)
+    assert encoded.dtype == np.uint16
+    assert encoded.tolist() == [[256, 2, 65280, 65280, 0, 0]]
 
 
 def test_tables_are_consistent(root: Path) -> None:
@@ -339,6 +353,13 @@ def test_cameras_see_the_points(devkit: Any) -> None:
     assert hits >= (sweep.instance == 2).sum()
 
 
+def test_intersections(root: Path) -> None:
+    """The first of each town's two road segments."""
+    for location in list(LOCATIONS)[:SCENES]:
+        expansion = json.loads((root / "maps" / "expansion" / f"{location}.json").read_text())
+        assert [row["is_intersection"] for row in expansion["road_segment"]] == [True, False]
+
+
 def test_maps(root: Path, devkit: Any) -> None:
     map_api = pytest.importorskip("nuscenes.map_expansion.map_api")
     for location in LOCATIONS:
@@ -359,7 +380,7 @@ def test_maps(root: Path, devkit: Any) -> None:
         town = map_api.NuScenesMap(str(root), log["location"])
         layers = {
             "drivable_area": 120 * 120 + 60 * 20,
-            "road_segment": 60 * 20,
+            "road_segment": 20 * 20 + 60 * 20,
             "road_block": 60 * 10,
             "lane": 60 * 10,
             "ped_crossing": 4 * 20,
@@ -630,6 +651,36 @@ def test_foreign_folders_are_refused(tmp_path: Path) -> None:
         make_world(interrupted, SMALL, workers=1, make_drive=FakeDrive)
 
 
+def test_second_writer_is_refused(tmp_path: Path) -> None:
+    """The lock lasts as long as its holder: a killed one leaves nothing that blocks."""
+    folder = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(folder, fcntl.LOCK_EX)
+    try:
+        with pytest.raises(WorldFolderError, match="must have one writer, got another process"):
+            make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
+    finally:
+        os.close(folder)
+    assert list(tmp_path.iterdir()) == []
+    make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
+
+
+def test_other_libraries(tmp_path: Path, small: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """An interrupted world needs the versions it was begun with; a complete one does not mind."""
+    with monkeypatch.context() as patch:
+        patch.setattr("pred.world.write_dataset", lambda *arguments: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
+    other = {"embreex": "0.0.1", "numpy": "0.0.1", "pillow": "0.0.1"}
+    with monkeypatch.context() as patch:
+        patch.setattr("pred.world._libraries", lambda: other)
+        with pytest.raises(WorldFolderError, match=r"libraries must be \{'embreex': '0\.0\.1'.* as here, got"):
+            make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
+    make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
+    assert tree(tmp_path) == small
+    monkeypatch.setattr("pred.world._libraries", lambda: other)
+    make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
+
+
 def test_large_town_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"town must be at most 400 m wide, got 560\.0, 120\.0 m"):
         make_world(tmp_path, SMALL, workers=1, make_drive=LargeTownDrive)
@@ -661,8 +712,8 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.
     options = "--scenes 10 --seed 5 --keyframes 3 --image-scale 0.5 --as v1.0-mini --exact-labels --workers 2"
     assert cli.main(["world", "make", str(tmp_path), *options.split()]) == 0
     assert seen == {
-        "scenes": 10, "seed": 5, "keyframes": 3, "image_scale": 0.5, "version": "v1.0-mini", "sweep_images": False,
-        "exact_labels": True, "out": tmp_path,
+        "scenes": 10, "seed": 5, "keyframes": 3, "image_scale": 0.5, "layout": "nuscenes", "version": "v1.0-mini",
+        "sweep_images": False, "exact_labels": True, "out": tmp_path,
     }  # fmt: skip
     assert cli.main(["world", "make", str(tmp_path), "--scenes", "0"]) == 1
     assert "scenes must be in [1, 108]" in capfd.readouterr().err

@@ -7,6 +7,8 @@ from __future__ import annotations
 import io
 import json
 import math
+import pickle
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +22,8 @@ from rich.console import Console
 
 from pred.data.batch import DataConfig, TrainingBatches, build_source
 from pred.data.frame import Boxes, Camera, Frame, FrameError, invert_rigid, pose_matrix, quaternion_of, transform_points
-from pred.data.once import OnceFrames
+from pred.data.index import FILE_NAME, FrameIndex
+from pred.data.once import OnceFrames, build_index
 from pred.data.once_writer import HALF_TURN, OnceRecord, boxes_in_image, once_record, write_once, write_once_splits
 from pred.data.undistort import distort_rays
 from pred.data_check import Report, check_data
@@ -117,7 +120,8 @@ def test_json_is_the_official_one(root: Path) -> None:
     # cam_to_velo: the optical axis is -y, and the centre lies where the camera is.
     np.testing.assert_allclose(np.array(front["cam_to_velo"])[:3, 2], [0, -1, 0], atol=1e-12)
     np.testing.assert_allclose(np.array(front["cam_to_velo"])[:3, 3], [-0.1, 0.2, -0.3], atol=1e-12)
-    assert front["cam_intrinsic"] == INTRINSICS.tolist() and front["distortion"] == [0.0] * 5
+    # OpenCV's pixel centres are whole numbers.
+    assert front["cam_intrinsic"] == [[50, 0, 31], [0, 50, 17], [0, 0, 1]] and front["distortion"] == [0.0] * 5
     first, second, third, fourth = content["frames"]
     assert first["frame_id"] == str(FIRST_MS) and first["sequence_id"] == SEQUENCE
     # Relative to the first frame, quaternion x, y, z, w first.
@@ -345,6 +349,112 @@ def test_frames_of_the_configuration(root: Path) -> None:
         replace(config, root="")
 
 
+# The index
+
+
+@pytest.fixture
+def builds(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Roots, once for each time that the JSON files of one are read."""
+    roots: list[Path] = []
+
+    def counted(root: Path, report: Any) -> FrameIndex:
+        roots.append(root)
+        return build_index(root, report)
+
+    monkeypatch.setattr("pred.data.once.build_index", counted)
+    return roots
+
+
+def test_json_files_are_read_once(root: Path, builds: list[Path]) -> None:
+    frames = OnceFrames(root)
+    assert (root / FILE_NAME).is_file()
+    again = OnceFrames(root, split="train", undistort=False)
+    sent = pickle.dumps(frames)
+    received = pickle.loads(sent)
+    assert builds == [root] and len(sent) < 2000
+    for one, other in zip(map(frames.load, range(4)), map(received.load, range(4)), strict=True):
+        np.testing.assert_array_equal(one.points, other.points)
+        np.testing.assert_array_equal(one.T_world_from_lidar, other.T_world_from_lidar)
+    assert [again.token(index) for index in range(4)] == [frames.token(index) for index in range(4)]
+
+
+def test_a_changed_or_added_file_makes_it_stale(root: Path, builds: list[Path]) -> None:
+    assert OnceFrames(root).load(0).boxes is not None
+    edit(root, lambda content: content["frames"][0].pop("annos"))
+    assert OnceFrames(root).load(0).boxes is None
+    write_once(root, "000027", records(2, seed=1))
+    assert [len(OnceFrames(root)), len(OnceFrames(root, split="train")), len(builds)] == [6, 4, 3]
+    shutil.rmtree(root / "data" / "000027")
+    assert [len(OnceFrames(root)), len(builds)] == [4, 4]
+
+
+def test_a_damaged_index_is_made_anew(root: Path, builds: list[Path]) -> None:
+    pose = OnceFrames(root).load(1).T_world_from_lidar
+    content = bytearray((root / FILE_NAME).read_bytes())
+    content[content.index(pose[0, 3].tobytes()) + 6] ^= 1
+    (root / FILE_NAME).write_bytes(content)
+    with pytest.warns(UserWarning, match=f"{FILE_NAME}: index must be intact, got a wrong checksum; it is made anew"):
+        frames = OnceFrames(root)
+    np.testing.assert_array_equal(frames.load(1).T_world_from_lidar, pose)
+    assert len(builds) == 2
+
+
+def test_broken_sequences_of_other_splits_do_not_matter(root: Path, builds: list[Path]) -> None:
+    write_once(root, "000027", records(2))
+    write_once(root, "000104", records(2))
+    broken = root / "data" / "000027" / "000027.json"
+    whole = broken.read_text()
+    broken.write_text("{")
+    (root / "data" / "000080").mkdir()  # pictures alone
+    write_once_splits(root, {"train": [SEQUENCE, "000104"], "val": ["000104", "000027"]})
+    for _ in range(2):
+        assert len(OnceFrames(root, split="train")) == 6
+        with pytest.raises(FrameError, match=rf"{broken}: file of the sequence must be valid JSON"):
+            OnceFrames(root, split="val")
+    assert len(builds) == 1
+    broken.write_text(whole)
+    frames = OnceFrames(root, split="val")
+    assert [frames.token(index)[:6] for index in range(4)] == ["000104"] * 2 + ["000027"] * 2
+
+
+def test_calibrations_by_sequence(root: Path) -> None:
+    """Each sequence has its own cameras, with numbers of their own."""
+    other = records(2)
+    moved = np.eye(4)
+    moved[:3, 3] = [0.0, 0.0, 0.7]
+    for record in other:
+        front = replace(record.cameras[0], name="cam05", intrinsics=INTRINSICS + np.diag([3.0, 3.0, 0.0]))
+        record.cameras = [replace(front, T_camera_from_lidar=moved @ front.T_camera_from_lidar)]
+    write_once(root, "000027", other)
+    write_once(root, "000028", [OnceRecord(FIRST_MS, records(1)[0].points)])  # none
+    frames = OnceFrames(root)
+    cameras = [[camera.name for camera in frames.load(index).cameras] for index in range(7)]
+    assert cameras == [["cam05"]] * 2 + [[]] + [["cam01", "cam09"]] * 4
+    (camera_05,) = frames.load(1).cameras
+    np.testing.assert_array_equal(camera_05.intrinsics, INTRINSICS + np.diag([3.0, 3.0, 0.0]))
+    np.testing.assert_allclose(camera_05.T_camera_from_lidar, other[1].cameras[0].T_camera_from_lidar, atol=1e-12)
+
+
+def test_annotations_are_as_they_are_in_the_file(root: Path) -> None:
+    boxes = [[1.5, -2.0, 0.25, 4.0, 2.0, 1.5, yaw] for yaw in (-6.0, -3.5, 0.0, 3.0, 4.0, 6.2)]
+    edit(root, lambda content: content["frames"][1].update(annos={"names": ["Car"] * 6, "boxes_3d": boxes}))
+    frames = OnceFrames(root)
+    annotation = frames.annotation(1)
+    assert annotation is not None and annotation[0] == ["Car"] * 6
+    np.testing.assert_allclose(annotation[1], boxes, rtol=0, atol=1e-14)
+    loaded = frames.load(1).boxes
+    assert loaded is not None and (np.abs(loaded.yaw_rad) <= math.pi).all()
+
+
+def test_a_tree_without_frames(root: Path) -> None:
+    edit(root, lambda content: content["frames"].clear())
+    with pytest.raises(ValueError, match=r"data\.split must select frames of .* got none: None"):
+        OnceFrames(root)
+    shutil.rmtree(root / "data" / SEQUENCE)
+    with pytest.raises(ValueError, match=r"data\.split must select frames of .* got none: None"):
+        OnceFrames(root)
+
+
 # Undistortion
 
 
@@ -359,10 +469,9 @@ def test_undistorted_images_agree_with_their_intrinsics(root: Path) -> None:
     for xyz in ([[1.8, -8.0, 1.0]], [[-2.0, -9.0, -1.0]]):
         point = np.array(xyz)
         on_camera = transform_points(front.T_camera_from_lidar, point)
-        u, v = (distort_rays(on_camera[:, :2] / on_camera[:, 2:], DISTORTION) @ INTRINSICS[:2, :2].T)[0] + INTRINSICS[
-            :2, 2
-        ]
-        grid_v, grid_u = np.mgrid[:HEIGHT, :WIDTH]
+        bent = distort_rays(on_camera[:, :2] / on_camera[:, 2:], DISTORTION)
+        u, v = (bent @ INTRINSICS[:2, :2].T)[0] + INTRINSICS[:2, 2]
+        grid_v, grid_u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
         blob = 255 * np.exp(-((grid_u - u) ** 2 + (grid_v - v) ** 2) / (2 * 2.0**2))
         image = np.repeat(blob[..., None], 3, axis=2).astype(np.uint8)
         Image.fromarray(image).save(root / "data" / SEQUENCE / "cam01" / f"{FIRST_MS}.jpg", quality=95)
@@ -375,6 +484,25 @@ def test_undistorted_images_agree_with_their_intrinsics(root: Path) -> None:
     raw = OnceFrames(root, undistort=False).load(0).cameras[0]
     assert isinstance(raw.image, Path)
     np.testing.assert_array_equal(raw.intrinsics, INTRINSICS)
+
+
+def test_pixels_are_those_of_opencv_and_a_half(root: Path) -> None:
+    """OpenCV's pixel (0, 0) has its centre there; ours covers [0, 1)."""
+    cv2 = pytest.importorskip("cv2")
+    points = np.random.default_rng(2).uniform((-4, -20, -2), (4, -6, 2), (50, 3))
+    for distortion in ([0.0] * 5, DISTORTION):
+        edit(root, lambda content, d=distortion: content["calib"]["cam01"].update(distortion=d))  # type: ignore[misc]
+        calibration = json.loads(json_file(root).read_text())["calib"]["cam01"]
+        K, d = np.array(calibration["cam_intrinsic"]), np.array(calibration["distortion"])
+        T_camera_from_lidar = np.linalg.inv(calibration["cam_to_velo"])
+        rotation, _ = cv2.Rodrigues(T_camera_from_lidar[:3, :3])
+        straight, _ = cv2.getOptimalNewCameraMatrix(K, d, (WIDTH, HEIGHT), 0)
+        for undistort, matrix in ((True, straight if any(distortion) else K), (False, K)):
+            uv, _ = cv2.projectPoints(points, rotation, T_camera_from_lidar[:3, 3], matrix, None)
+            camera = OnceFrames(root, undistort=undistort).load(0).cameras[0]
+            # OpenCV's new matrix comes from five iterations, ours from as many as are needed.
+            atol = 5e-3 if matrix is straight else 1e-9
+            np.testing.assert_allclose(camera.project(points)[0], uv[:, 0] + 0.5, rtol=0, atol=atol)
 
 
 def test_distortion_that_cannot_be_undone_names_the_file(root: Path) -> None:
@@ -445,8 +573,9 @@ def test_wrong_frames(root: Path, frame: dict[str, Any], text: str) -> None:
         ({"cam_to_velo": np.eye(3).tolist()}, "calib cam01: cam_to_velo must be 4 x 4 numbers, got [3, 3]"),
         ({"cam_to_velo": np.diag([1.0, 2, 1, 1]).tolist()}, "calib cam01: cam_to_velo must be a rigid transform"),
         ({"cam_to_velo": np.diag([1.0, 1, -1, 1]).tolist()}, "calib cam01: cam_to_velo must be a rigid transform"),
-        ({"cam_intrinsic": [[1.0]]}, "calib cam01: cam_intrinsic must be 3 x 3 numbers, got [1, 1]"),
+        ({"cam_intrinsic": [[1.0]]}, "calib cam01: cam_intrinsic must be 3 x 3 finite numbers, got [[1.]]"),
         ({"cam_intrinsic": np.zeros((3, 3)).tolist()}, "calib cam01: cam_intrinsic must have positive focal lengths"),
+        ({"cam_intrinsic": np.diag([9.0, 9, 0]).tolist()}, "calib cam01: cam_intrinsic must have positive focal"),
         ({"cam_intrinsic": [[float("inf")] * 3] * 3}, "calib cam01: cam_intrinsic must be finite"),
         ({"distortion": [0.1] * 7}, "calib cam01: distortion must be (4, 5, 8) numbers, got 7"),
         ({"distortion": "none"}, "calib cam01: distortion must be numbers"),
@@ -619,3 +748,19 @@ def test_data_check_finds_all_damage(root: Path, fast: bool) -> None:
     for path in [*broken, *([] if fast else behind_headers)]:
         assert f"{path}: " in text, path
     assert report.num_problems == (6 if fast else 8)
+
+
+def test_data_check_finds_lenses_that_fold(root: Path) -> None:
+    write_once(root, "000027", records(1))
+    for name, camera_name in ((SEQUENCE, "cam09"), ("000027", "cam01")):
+        path = root / "data" / name / f"{name}.json"
+        content = json.loads(path.read_text())
+        content["calib"]["cam01"]["distortion"] = DISTORTION
+        content["calib"][camera_name]["distortion"] = [-30.0, 0, 0, 0, 0]
+        path.write_text(json.dumps(content))
+    # The size is that of the first image that can be read.
+    (root / "data" / SEQUENCE / "cam09" / f"{FIRST_MS}.jpg").unlink()
+    report, text = check(root, fast=True)
+    assert report.num_problems == 2
+    for name, camera_name in ((SEQUENCE, "cam09"), ("000027", "cam01")):
+        assert f"{name}.json: calib {camera_name}: distortion must be one-to-one inside the image" in text

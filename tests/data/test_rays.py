@@ -178,6 +178,8 @@ def test_direct_projection_hand_computed(tmp_path: Path) -> None:
     assert found.class_id.tolist() == [13, 13, 2]
     by_camera = frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.0).semantic[0]
     assert np.array_equal(found.target, by_camera.target) and (by_camera.origins == [0.0, 1.0, 0.0]).all()
+    for rays in (found, by_camera):
+        np.testing.assert_allclose(rays.origins + rays.directions * rays.range_m[:, None], IN_LINE, rtol=1e-6)
     assert [column.dtype for column in found] == [column.dtype for column in by_camera]
 
 

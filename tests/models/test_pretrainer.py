@@ -8,6 +8,7 @@ import copy
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 import torch
@@ -59,7 +60,7 @@ def toy_batch(num_frames: int = 2, num_rays: int = 24, num_points: int = 60, see
         return fields, depth_m, (radius_m > 8).long()
 
     depth_rays, depth_m, _ = rays()
-    semantic_rays, _, labels = rays()
+    semantic_rays, range_m, labels = rays()
     xy = 32 * torch.rand(num_frames * num_points, 2, generator=generator) - 16
     points = torch.cat([xy, torch.full_like(xy[:, :1], GROUND_M), torch.rand(len(xy), 2, generator=generator)], 1)
     return Batch(
@@ -70,6 +71,7 @@ def toy_batch(num_frames: int = 2, num_rays: int = 24, num_points: int = 60, see
         depth=DepthRays(**depth_rays, depth_m=depth_m, depth_factor=torch.ones_like(depth_m)),
         semantic=SemanticRays(
             **semantic_rays,
+            range_m=range_m,
             target=F.one_hot(labels, 3).float(),
             confidence=torch.ones_like(depth_m),
         ),
@@ -184,16 +186,38 @@ def with_bad_rays(batch: Batch, bad: float) -> Batch:
     return replace(batch, depth=DepthRays(**extend(batch.depth)), semantic=SemanticRays(**extend(batch.semantic)))
 
 
+@pytest.mark.parametrize("semantic_at", ["ray", "return"])
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_bad_rays_contribute_nothing(bad: float, backend: str) -> None:
-    model = make()
+def test_bad_rays_contribute_nothing(bad: float, semantic_at: Literal["ray", "return"], backend: str) -> None:
+    loss = LossConfig(semantic_at=semantic_at)
+    model = make(loss=loss)
     clean = model(toy_batch())
     expected = gradients(model, clean)
-    model = make()
+    model = make(loss=loss)
     output = model(with_bad_rays(toy_batch(), bad))
     assert output.num_rays == clean.num_rays
     torch.testing.assert_close(output.loss, clean.loss)
     assert_same_gradients(gradients(model, output), expected)
+
+
+def test_semantics_at_the_returns_need_no_rendering() -> None:
+    """The term is the cross-entropy of the field at the returns, and where the rays come from does not matter."""
+    model, batch = make(loss=LossConfig(semantic_at="return")).eval(), toy_batch()
+    assert batch.semantic is not None
+    rays = batch.semantic
+    returns = rays.origins + rays.directions * rays.range_m[..., None]
+    logits = model.field(model.encode(batch.points, batch.point_offsets), returns).semantics
+    expected = -(rays.target * (logits.softmax(-1) + 1e-6).log()).sum(-1).mean()
+    torch.testing.assert_close(model(batch).terms["semantic"], expected.detach())
+    shift = torch.tensor([0.5, -0.25, 0.1])
+    range_m = (returns - shift).norm(dim=-1)
+    moved = replace(
+        rays,
+        origins=shift.expand_as(returns),
+        directions=(returns - shift) / range_m[..., None],
+        range_m=range_m,
+    )
+    torch.testing.assert_close(model(replace(batch, semantic=moved)).terms["semantic"], expected.detach())
 
 
 def test_no_valid_ray_gives_zero_loss_and_gradient(backend: str) -> None:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from pred.data.frame import Camera, invert_rigid
 from pred.data.world import blocks, sensors
-from pred.data.world.actors import Actor
 from pred.data.world.meshes import Material, boxes, loft, merge
 from pred.data.world.moment import Layer, Sector, Surfaces, cover, moving_layer
 from pred.data.world.motion import rigid
@@ -50,15 +49,9 @@ CATEGORIES = (
 )  # fmt: skip
 """Official names of the nuScenes-lidarseg categories, by index."""
 NOISE, EGO = CATEGORIES.index("noise"), CATEGORIES.index("vehicle.ego")
-ANNOTATED_M = 80.0
-"""Annotations end at that distance from the ego car (in the plane)."""
 SEEN_M = 150.0
 """Moving actors that are farther away are not drawn."""
 
-_GRID = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-_MEMORY_US = 1_000_000
-_IN_SIGHT, _FEWEST_BEAMS = 0.2, 4.0
-_BEAM_SR = np.deg2rad((sensors.HIGHEST_RING_DEG - sensors.LOWEST_RING_DEG) / (NUM_RINGS - 1)) * 2 * np.pi / NUM_COLUMNS
 _EPOCH_US = 1_600_000_000_000_000
 _SCENE_STRIDE_US = 600_000_000
 _LEAD_US, _TAIL_US = 2_000_000, 200_000
@@ -124,7 +117,7 @@ class Drive:
 
     Attributes:
         keyframe_us: [K] int64, LiDAR stamps of the keyframes.
-        actors: everything annotated, also what is far away or hidden; ``actors[i].instance == i + 1``.
+        actors: everything that annotations are about, also what is far away or hidden; ``actors[i].instance == i + 1``.
         town: the map.
         sun: [3] float32, unit vector towards the sun.
         camera_offsets_us: by camera, relative to the keyframe's stamp.
@@ -170,40 +163,6 @@ class Drive:
         """[4, 4] float64: pose of the ego car, on the ground below its rear axle."""
         x, y, yaw_rad = self._ego_track(np.array([time_us]))[0]
         return rigid(x, y, 0.0, yaw_rad)
-
-    def annotated(self, time_us: int) -> list[Actor]:
-        """Actors that annotators would mark: within `ANNOTATED_M` of the ego car, and in sight of the LiDAR's place
-        now or one second earlier or later.
-
-        In sight is what shows a fifth, and as much as four beams of the LiDAR should meet; moving actors hide nothing
-        here, and how many points there are in the end is not asked.
-        """
-        ego = self.T_world_from_ego(time_us)[:2, 3]
-        near = [actor for actor in self.actors if np.linalg.norm(actor.pose(time_us)[:2, 3] - ego) < ANNOTATED_M]
-        seen = np.zeros(len(near), dtype=np.bool_)
-        for offset_us in (0, -_MEMORY_US, _MEMORY_US):
-            if self.start_us <= time_us + offset_us <= self.end_us:
-                seen |= self._in_sight(near, time_us + offset_us)
-        return [actor for actor, visible in zip(near, seen, strict=True) if visible]
-
-    def _in_sight(self, actors: list[Actor], time_us: int) -> NDArray[np.bool_]:
-        """[len(actors)] whether enough of the box shows behind what stands still: a share of 27 places in it, and
-        about four beams' worth."""
-        if not actors:
-            return np.zeros(0, dtype=np.bool_)
-        origin = (self.T_world_from_ego(time_us) @ sensors.T_EGO_FROM_LIDAR)[:3, 3]
-        poses = np.array([actor.pose(time_us) for actor in actors])
-        sizes = np.array([actor.size_lwh_m for actor in actors])
-        places = (0.42 * _GRID[None] * sizes[:, None]) @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
-        sight = (places - origin).reshape(-1, 3)
-        distance_m = np.linalg.norm(sight, axis=1, keepdims=True)
-        hits = self._still.cast(origin.astype(np.float32), (sight / distance_m).astype(np.float32))
-        own = hits.instance == np.repeat([actor.instance for actor in actors], len(_GRID))
-        clear = ((hits.t_m > distance_m[:, 0]) | own).reshape(len(actors), -1).mean(axis=1)
-        # Width times height over the solid angle between neighbouring beams.
-        area_m2 = np.sqrt(sizes[:, 0] * sizes[:, 1]) * sizes[:, 2]
-        beams = clear * area_m2 / (np.linalg.norm(poses[:, :3, 3] - origin, axis=1) ** 2 * _BEAM_SR)
-        return np.asarray((clear > _IN_SIGHT) & (beams > _FEWEST_BEAMS))
 
     def scan(self, time_us: int) -> Sweep:
         """The LiDAR revolution that ends at ``time_us``."""

@@ -26,14 +26,17 @@ from PIL import Image, ImageDraw
 
 from pred.checkpoint import atomic_write, sync_folder, write_text
 from pred.data.frame import MIN_PROJECTION_DEPTH_M, Camera, invert_rigid, quaternion_of, transform_points
+from pred.data.image_depth import VALUES_PER_M
 from pred.data.nuscenes import LIDAR_CHANNEL
 from pred.data.world.actors import Actor
+from pred.data.world.annotation import annotated_keyframes, candidates
 from pred.data.world.drive import CATEGORIES, Drive, View
-from pred.data.world.sensors import CALIBRATED_MOUNTS, MAX_RANGE_M, T_EGO_FROM_LIDAR, mounted_camera
+from pred.data.world.sensors import CALIBRATED_MOUNTS, T_EGO_FROM_LIDAR, mounted_camera
 from pred.data.world.town import TownMap
 
-OFFICIAL_IMAGE_SIZE = (1600, 900)
+OFFICIAL_IMAGE_SIZES = {"nuscenes": (1600, 900), "once": (1920, 1020)}
 JPEG_QUALITY = 90
+DEPTH_MAX_M = 255.0
 MAX_TOWN_M = 400.0
 REGION_M = 475.0
 """Side of the square of map that each scene has to itself. Towns keep 75 m apart: a BEV grid of 100 m x 100 m around a
@@ -76,7 +79,7 @@ LOCATIONS = {
 
 POLYGON_LAYERS: dict[str, Row] = {
     "drivable_area": {},
-    "road_segment": {"is_intersection": False, "drivable_area_token": ""},
+    "road_segment": {"drivable_area_token": ""},
     "road_block": {"from_edge_line_token": "", "to_edge_line_token": "", "road_segment_token": ""},
     "lane": {
         "lane_type": "CAR",
@@ -111,10 +114,11 @@ class WorldSettings:
         scenes: number of drives.
         seed: draws towns, drives and sensor noise.
         keyframes: keyframes per drive, 2 a second.
-        image_scale: size of the images against 1600 x 900; the intrinsics follow.
+        image_scale: size of the images against 1600 x 900 (nuScenes) or 1920 x 1020 (ONCE); the intrinsics follow.
+        layout: ``nuscenes`` or ``once``, whose worlds have neither ``version`` nor ``sweep_images``.
         version: name of the table folder: ``v1.0-world``, or ``v1.0-mini``, whose ten scenes bear the official names.
         sweep_images: also write pictures at the times of the LiDAR sweeps between keyframes.
-        exact_labels: also write exact class maps as pseudo labels.
+        exact_labels: also write exact class maps as pseudo labels, and exact depth maps.
 
     Raises:
         ValueError: a value is out of range.
@@ -124,12 +128,15 @@ class WorldSettings:
     seed: int = 0
     keyframes: int = 40
     image_scale: float = 0.25
+    layout: str = "nuscenes"
     version: str = WORLD_VERSION
     sweep_images: bool = False
     exact_labels: bool = False
 
     def __post_init__(self) -> None:
-        if not 1 <= self.scenes <= len(REGIONS):
+        if self.layout not in OFFICIAL_IMAGE_SIZES:
+            raise ValueError(f"world: layout must be {' or '.join(OFFICIAL_IMAGE_SIZES)}, got {self.layout!r}")
+        if self.scenes < 1 or (self.layout == "nuscenes" and self.scenes > len(REGIONS)):
             raise ValueError(
                 f"world: scenes must be in [1, {len(REGIONS)}], as many towns as the official maps have room for, "
                 f"got {self.scenes}; more scenes: a second world with another seed"
@@ -138,6 +145,9 @@ class WorldSettings:
             raise ValueError(f"world: keyframes must be at least 1, got {self.keyframes}")
         if not 0.02 <= self.image_scale <= 1.0:
             raise ValueError(f"world: image_scale must be in [0.02, 1], got {self.image_scale}")
+        if self.layout == "once" and (self.version != WORLD_VERSION or self.sweep_images):
+            given = "images of sweeps" if self.sweep_images else self.version
+            raise ValueError(f"world: layout once must have no version and no images of sweeps, got {given}")
         if self.version not in (WORLD_VERSION, MINI_VERSION):
             raise ValueError(f"world: version must be {WORLD_VERSION} or {MINI_VERSION}, got {self.version!r}")
         if self.version == MINI_VERSION and self.scenes != len(MINI_SCENES):
@@ -146,7 +156,7 @@ class WorldSettings:
     @property
     def image_size(self) -> tuple[int, int]:
         """Width and height of the images in pixels."""
-        width, height = (round(pixels * self.image_scale) for pixels in OFFICIAL_IMAGE_SIZE)
+        width, height = (round(pixels * self.image_scale) for pixels in OFFICIAL_IMAGE_SIZES[self.layout])
         return width, height
 
     def scene_name(self, scene: int) -> str:
@@ -225,7 +235,7 @@ def write_keyframe(root: Path, settings: WorldSettings, drive: Drive, scene: int
         path = files.add(LIDAR_CHANNEL, time_us, is_keyframe=time_us == keyframe_us)
         files.write(path, sweep.points.astype("<f4", copy=False).tobytes())
         if time_us == keyframe_us:
-            points = sweep.points[:, :3].astype(np.float64)
+            points = sweep.points
             token = _data_token(settings, scene, LIDAR_CHANNEL, time_us)
             files.write(_lidarseg_file(settings, token), sweep.category.astype(np.uint8, copy=False).tobytes())
     pictures = []
@@ -238,27 +248,33 @@ def write_keyframe(root: Path, settings: WorldSettings, drive: Drive, scene: int
             if time_us != keyframe_us:
                 continue
             if settings.exact_labels:
-                files.write_image(f"pseudo/exact/{mount.name}/{Path(path).stem}.png", view.class_id, format="PNG")
+                name = f"exact/{mount.name}/{Path(path).stem}.png"
+                files.write_image(f"pseudo/{name}", view.class_id, format="PNG")
+                files.write_image(f"depth/{name}", encode_depth(view.depth_m), format="PNG")
             camera = mounted_camera(mount, *settings.image_size)
             T_world_from_lidar = drive.T_world_from_ego(camera_us) @ T_EGO_FROM_LIDAR
             T_camera_from_world = camera.T_camera_from_lidar @ invert_rigid(T_world_from_lidar)
             pictures.append(_Picture(view, camera, T_camera_from_world, camera_us))
     T_lidar_from_world = invert_rigid(drive.T_world_from_ego(keyframe_us) @ T_EGO_FROM_LIDAR)
-    actors, boxes = _actors_in_range(drive.actors, keyframe_us, T_lidar_from_world)
-    num_points = _count_points(points, boxes, [actor.size_lwh_m for actor in actors])
-    shares = _visible_shares(pictures, actors)
+    found = candidates(drive.actors, keyframe_us, T_lidar_from_world, points)
+    shares = _visible_shares(pictures, [candidate.actor for candidate in found])
     part = {
         "time_us": keyframe_us,
         "data": files.data,
         "actors": [
-            _actor_part(actor, keyframe_us, count, share)
-            for actor, count, share in zip(actors, num_points, shares, strict=True)
+            _actor_part(candidate.actor, keyframe_us, candidate.num_points, share)
+            for candidate, share in zip(found, shares, strict=True)
         ],
         "bytes": files.num_bytes,
     }
     if keyframe == 0:
         part["town"] = _town_part(drive.town)
     return part
+
+
+def encode_depth(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Depth as the KITTI depth benchmark stores it: 256 steps a metre; 0 for none and for more than `DEPTH_MAX_M`."""
+    return np.rint(np.where(depth_m <= DEPTH_MAX_M, depth_m, 0.0) * VALUES_PER_M).astype(np.uint16)
 
 
 class _Picture(NamedTuple):
@@ -297,7 +313,7 @@ class _Files:
             file.write(content)
         self.num_bytes += len(content)
 
-    def write_image(self, filename: str, image: NDArray[np.uint8], **options: Any) -> None:
+    def write_image(self, filename: str, image: NDArray[np.uint8 | np.uint16], **options: Any) -> None:
         with atomic_write(self._path(filename)) as file:
             Image.fromarray(image).save(file, **options)
             self.num_bytes += file.tell()
@@ -324,30 +340,6 @@ def _actor_part(actor: Actor, time_us: int, num_points: int, visible_share: floa
         "num_lidar_pts": num_points,
         "visibility": 1 + int(np.searchsorted(VISIBILITY_BOUNDS, visible_share, side="right")),
     }
-
-
-def _actors_in_range(
-    actors: Sequence[Actor], time_us: int, T_lidar_from_world: NDArray[np.float64]
-) -> tuple[list[Actor], list[NDArray[np.float64]]]:
-    """Actors of which the LiDAR can reach the centre, and T_lidar_from_box of each."""
-    boxes = [T_lidar_from_world @ actor.pose(time_us) for actor in actors]
-    near = [number for number, box in enumerate(boxes) if np.linalg.norm(box[:3, 3]) <= MAX_RANGE_M]
-    return [actors[number] for number in near], [boxes[number] for number in near]
-
-
-def _count_points(
-    points: NDArray[np.float64], boxes: Sequence[NDArray[np.float64]], sizes_m: Sequence[tuple[float, float, float]]
-) -> list[int]:
-    """Points [N, 3] of a sweep inside each box, faces included: the official meaning of num_lidar_pts."""
-    x, y = np.ascontiguousarray(points[:, 0]), np.ascontiguousarray(points[:, 1])
-    counts = []
-    for T_lidar_from_box, size_m in zip(boxes, sizes_m, strict=True):
-        half = np.asarray(size_m) / 2
-        centre_x, centre_y = T_lidar_from_box[:2, 3]
-        near = points[(x - centre_x) ** 2 + (y - centre_y) ** 2 <= half @ half]
-        inside = np.abs(transform_points(invert_rigid(T_lidar_from_box), near)) <= half
-        counts.append(int(inside.all(axis=1).sum()))
-    return counts
 
 
 def _visible_shares(pictures: Sequence[_Picture], actors: Sequence[Actor]) -> list[float]:
@@ -396,6 +388,11 @@ def _hidden_pixels(picture: _Picture, actor: Actor) -> int:
 def _town_part(town: TownMap) -> Row:
     part = {
         "polygons": {layer: [polygon.tolist() for polygon in town.polygons.get(layer, [])] for layer in POLYGON_LAYERS},
+        "intersections": [
+            number
+            for number, segment in enumerate(town.polygons["road_segment"])
+            if any(np.array_equal(segment, intersection) for intersection in town.intersections)
+        ],
         "lines": {layer: [line.tolist() for line in town.lines.get(layer, [])] for layer in LINE_LAYERS},
     }
     low, high = _extent(part)
@@ -406,7 +403,7 @@ def _town_part(town: TownMap) -> Row:
 
 def _extent(town: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """South-west and north-east corner [2] of a town's map."""
-    shapes = [shape for kind in town.values() for layer in kind.values() for shape in layer]
+    shapes = [shape for kind in ("polygons", "lines") for layer in town[kind].values() for shape in layer]
     points = np.concatenate([np.asarray(shape, dtype=np.float64) for shape in shapes] or [np.zeros((1, 2))])
     return points.min(axis=0), points.max(axis=0)
 
@@ -585,16 +582,10 @@ def _add_annotations(
     parts: Sequence[Part],
     offset: NDArray[np.float64],
 ) -> None:
-    """Boxes of every actor in range from its first keyframe with a LiDAR point to its last, with and without points."""
-    tracks: dict[int, list[tuple[int, Row]]] = {}
-    for number, part in enumerate(parts):
-        for actor in part["actors"]:
-            tracks.setdefault(actor["instance"], []).append((number, actor))
-    for instance, track in sorted(tracks.items()):
-        seen = [number for number, (_, actor) in enumerate(track) if actor["num_lidar_pts"]]
-        if not seen:
-            continue
-        track = track[seen[0] : seen[-1] + 1]
+    actors = [{actor["instance"]: actor for actor in part["actors"]} for part in parts]
+    num_points = [{instance: row["num_lidar_pts"] for instance, row in rows.items()} for rows in actors]
+    for instance, numbers in annotated_keyframes(num_points).items():
+        track = [(number, actors[number][instance]) for number in numbers]
         instance_token = make_token(settings.seed, scene, "instance", instance)
         tokens = [make_token(settings.seed, scene, "annotation", instance, number) for number, _ in track]
         tables.add(
@@ -644,7 +635,10 @@ class _Map:
                 nodes = self._add_nodes(polygon, np.asarray(shape) + offset[:2])
                 self.expansion["polygon"].append({"token": polygon, "exterior_node_tokens": nodes, "holes": []})
                 geometry = {"polygon_tokens": [polygon]} if layer == "drivable_area" else {"polygon_token": polygon}
-                self.expansion[layer].append({"token": make_token(token, layer, number), **geometry, **open_fields})
+                row = {"token": make_token(token, layer, number), **geometry, **open_fields}
+                if layer == "road_segment":
+                    row["is_intersection"] = number in town["intersections"]
+                self.expansion[layer].append(row)
         for layer, open_fields in LINE_LAYERS.items():
             for number, shape in enumerate(town["lines"][layer]):
                 line = make_token(token, layer, number, "line")
