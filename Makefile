@@ -16,7 +16,7 @@ PYTHON ?= python3
 TORCH ?= 2.13.0
 VENV ?= .venv
 RUN ?= runs/demo
-WORLD ?= build/demo_world
+WORLD ?= runs/demo_world
 MINUTES ?= 60
 SEED ?= 0
 # What wheel-check runs under: version of torch (or newest), colon, Python. One that is missing is an error.

@@ -59,6 +59,9 @@ def evaluate_rendering(arguments: list[str]) -> None:
         parser.add_argument(
             "--frames", type=int | None, default=None, help="evaluate only the first frames; all by default"
         )
+        parser.add_argument(
+            "--all-returns", action="store_true", help="every return that is not seen: for frames not trained on"
+        )
 
     options, config = _options_of_run(
         "pred evaluate rendering",
@@ -66,7 +69,44 @@ def evaluate_rendering(arguments: list[str]) -> None:
         arguments,
         add_options,
     )
-    run_evaluation(config, Path(options.folder), checkpoint=options.checkpoint, max_frames=options.frames)
+    run_evaluation(
+        config,
+        Path(options.folder),
+        checkpoint=options.checkpoint,
+        max_frames=options.frames,
+        all_returns=options.all_returns,
+    )
+
+
+def evaluate_probe(arguments: list[str]) -> None:
+    from pred.evaluate_probe import evaluate_probe as run_evaluation
+
+    def add_options(parser: Any) -> None:
+        parser.add_argument("--train-split", default="train", help="frames that the probe is fitted on")
+        parser.add_argument("--val-split", default="val", help="frames that it is measured on")
+        parser.add_argument("--cells-per-frame", type=int, default=512, help="cells drawn per fitted frame")
+        parser.add_argument(
+            "--frames",
+            type=int | None,
+            default=None,
+            help="so many frames of each split, evenly spread; all by default",
+        )
+
+    options, config = _options_of_run(
+        "pred evaluate probe",
+        "Fit a linear classifier of BEV cells on the frozen encoder, and on an untrained one.",
+        arguments,
+        add_options,
+    )
+    run_evaluation(
+        config,
+        Path(options.folder),
+        checkpoint=options.checkpoint,
+        train_split=options.train_split,
+        val_split=options.val_split,
+        cells_per_frame=options.cells_per_frame,
+        max_frames=options.frames,
+    )
 
 
 def evaluate_once(arguments: list[str]) -> None:
@@ -212,12 +252,15 @@ class Command(NamedTuple):
 
 EVALUATIONS = {
     "rendering": Command(evaluate_rendering, "RUN: depth and semantics of held-out returns"),
+    "probe": Command(evaluate_probe, "RUN: classes of BEV cells by a linear probe on the frozen encoder"),
     "once": Command(evaluate_once, "PREDICTIONS: average precision of 3D boxes by the rules of the ONCE benchmark"),
 }
 
 COMMANDS = {
     "pretrain": Command(pretrain, "pre-train a LiDAR encoder; --resume RUN continues"),
-    "evaluate": Command(evaluate, "evaluate rendering RUN: errors on held-out returns; once FILE: AP of 3D boxes"),
+    "evaluate": Command(
+        evaluate, "evaluate rendering RUN, probe RUN: errors, a linear probe; once FILE: AP of 3D boxes"
+    ),
     "view": Command(view, "view RUN: pictures of what the run renders"),
     "world": Command(world, "make OUT: a data set of procedural towns in the nuScenes or ONCE layout"),
     "label": Command(label, "pseudo labels of images by a segmentation network; label train makes one"),

@@ -6,14 +6,18 @@ A fixed share of the keyframe returns is neither input nor target of any trainin
 network sees the 5 % of a fixed mask and renders the rays towards the held-out returns: from the LiDAR for depth, from
 the cameras for semantics. Beside it stand the untrained network of the same seed, and "range of the visible point that
 is nearest in angle", which needs no learning.
+
+Where the data set knows the exact classes of its returns, the semantics rendered along the ray from the LiDAR are
+compared with them; beside them stands the label of the pixel that the return projects to.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,8 +25,10 @@ from numpy.typing import NDArray
 from rich.table import Table
 from torch import Tensor
 
-from pred.data.batch import Batch, build_source, evaluation_batch
+from pred.data.batch import Batch, build_source, evaluation_batch, evaluation_rows
 from pred.data.frame import CLASS_NAMES, NUM_CLASSES, Frame, FrameError, FrameSource
+from pred.data.lidarseg import MERGED_NAMES, NO_CLASS, NUM_MERGED, merged_classes
+from pred.data.rays import DepthTolerance, depths_agree
 from pred.models.pretrainer import Pretrainer
 from pred.pretrain import PretrainConfig, build_model, load_model, pick_device
 from pred.progress import Progress
@@ -30,6 +36,65 @@ from pred.run_folder import RunFolder, environment, write_json
 
 RAYS_PER_PRODUCT = 4096
 """Rows of the ray-to-point cosine matrix that are held at once."""
+
+OCCLUSION_TOLERANCE: DepthTolerance = (0.5, 0.02)
+"""(metres, share of the image's depth): a pixel that is nearer than its return by more shows another surface."""
+
+
+class Returns(NamedTuple):
+    """Returns of one frame whose class is known, and what their pixels show.
+
+    A return that several cameras see counts for the first of them.
+
+    Attributes:
+        merged: [R] int64 index of `MERGED_NAMES`; -1: no class, left out everywhere.
+        in_image: [R] bool, in the picture of a camera with a pseudo label.
+        projected: [R] int64 merged class of the label at its pixel; -1: none of these classes, or no label.
+        occluded: [R] bool, its pixel shows a nearer surface; None without depth maps.
+    """
+
+    merged: NDArray[np.int64]
+    in_image: NDArray[np.bool_]
+    projected: NDArray[np.int64]
+    occluded: NDArray[np.bool_] | None
+
+    def groups(self) -> dict[str, NDArray[np.bool_]]:
+        """The sets of returns that are measured: name to [R] mask."""
+        masks = {"all": np.ones(len(self.merged), dtype=bool), "in_image": self.in_image}
+        return masks if self.occluded is None else {**masks, "occluded": self.occluded}
+
+
+class Confusion:
+    """Counts [10, 11] of true merged class by predicted one; the last column is "none of these"."""
+
+    def __init__(self) -> None:
+        self.counts = np.zeros((NUM_MERGED, NUM_MERGED + 1), dtype=np.int64)
+
+    def add(self, true: NDArray[np.int64], predicted: NDArray[np.int64]) -> None:
+        """Count pairs of merged classes [N]; -1 as prediction is none, as true class it is left out."""
+        known = true >= 0
+        column = np.where(predicted < 0, NUM_MERGED, predicted)
+        pairs = (true * (NUM_MERGED + 1) + column)[known]
+        self.counts += np.bincount(pairs, minlength=self.counts.size).reshape(self.counts.shape)
+
+    def count_by_class(self) -> dict[str, int]:
+        """Number of true members of each class that occurs."""
+        return {MERGED_NAMES[k]: int(count) for k, count in enumerate(self.counts.sum(axis=1)) if count}
+
+    def summary(self) -> dict[str, Any]:
+        """Accuracy, and means over the classes that occur of recall and of intersection over union; None of nothing."""
+        truths, hits = self.counts.sum(axis=1), self.counts.diagonal()
+        unions = truths + self.counts.sum(axis=0)[:NUM_MERGED] - hits
+        present = np.flatnonzero(truths)
+        accuracies = {MERGED_NAMES[k]: float(hits[k] / truths[k]) for k in present}
+        ious = {MERGED_NAMES[k]: float(hits[k] / unions[k]) for k in present}
+        return {
+            "accuracy": float(hits.sum() / truths.sum()) if len(present) else None,
+            "mean_class_accuracy": float(np.mean(list(accuracies.values()))) if len(present) else None,
+            "miou": float(np.mean(list(ious.values()))) if len(present) else None,
+            "accuracy_by_class": accuracies,
+            "iou_by_class": ious,
+        }
 
 
 @dataclass
@@ -40,6 +105,7 @@ class Scores:
         depth_errors_m: one array of absolute errors per frame.
         opacity_sum: of the depth rays.
         predictions: [19, 20] camera rays by pseudo label and rendered class; column 19 counts rays that see nothing.
+        returns: true and rendered class of returns, along the ray from the LiDAR, for each set of `Returns.groups`.
     """
 
     depth_errors_m: list[NDArray[np.float32]] = field(default_factory=list)
@@ -47,6 +113,7 @@ class Scores:
     predictions: NDArray[np.int64] = field(
         default_factory=lambda: np.zeros((NUM_CLASSES, NUM_CLASSES + 1), dtype=np.int64)
     )
+    returns: dict[str, Confusion] = field(default_factory=lambda: defaultdict(Confusion))
 
     def summary(self) -> dict[str, Any]:
         """Plain values; None where there was nothing to measure."""
@@ -59,11 +126,16 @@ class Scores:
             "opacity_mean": self.opacity_sum / len(errors) if len(errors) else None,
             "semantic_accuracy": float(correct.sum() / rays_by_class.sum()) if len(present) else None,
             "semantic_accuracy_by_class": {CLASS_NAMES[k]: float(correct[k] / rays_by_class[k]) for k in present},
+            "returns": {group: confusion.summary() for group, confusion in self.returns.items()},
         }
 
 
 def evaluate_rendering(
-    config: PretrainConfig, run: Path, checkpoint: Path | None = None, max_frames: int | None = None
+    config: PretrainConfig,
+    run: Path,
+    checkpoint: Path | None = None,
+    max_frames: int | None = None,
+    all_returns: bool = False,
 ) -> dict[str, Any]:
     """Measure a run on held-out returns, print a table and write RUN/evaluation_rendering.json.
 
@@ -72,6 +144,8 @@ def evaluate_rendering(
         run: run folder.
         checkpoint: file to use; the run's latest by default.
         max_frames: evaluate only the first ones.
+        all_returns: aim at every keyframe return that the encoder does not see, held out or not: for frames that
+            training never used.
 
     Returns:
         What the file holds: plain values, errors in metres.
@@ -83,22 +157,28 @@ def evaluate_rendering(
         raise ValueError(f"evaluate: frames must be at least 1, got {max_frames}")
     folder = RunFolder(run)
     folder.require()
-    source = build_source(config.data)
+    source = build_source(config.data, point_classes=True)
     device = pick_device(config.train)
     trained, checkpoint = load_model(config, folder, checkpoint)
     networks = {"trained": trained.to(device), "untrained": build_model(config).eval().to(device)}
     scores = {name: Scores() for name in networks}
     baseline_errors_m: list[NDArray[np.float32]] = []
+    projected: dict[str, Confusion] = defaultdict(Confusion)
     skipped: dict[str, str] = {}
 
     num_frames = min(len(source), max_frames or len(source))
     with Progress("evaluated frame", num_frames) as progress:
         for frame in load_frames(source, num_frames, config.data.on_error == "skip", skipped):
-            batch = evaluation_batch(
-                frame, config.data, config.point_range, config.train.seed, config.renderer.near_m
-            ).to(device)
+            seed, near_m = config.train.seed, config.renderer.near_m
+            rows = evaluation_rows(frame, config.data, config.point_range, seed, near_m, all_returns)
+            batch = evaluation_batch(frame, config.data, config.point_range, seed, near_m, rows).to(device)
+            returns = returns_of(frame, rows.returns)
             for name, network in networks.items():
-                add_scores(scores[name], network, batch)
+                add_scores(scores[name], network, batch, returns)
+            if returns is not None:
+                for group, mask in returns.groups().items():
+                    if group != "all":  # a return in no picture has no pixel
+                        projected[group].add(returns.merged[mask], returns.projected[mask])
             rays = batch.depth
             nearest_m = range_of_nearest_visible(batch.points[:, :3], rays.directions[0])
             baseline_errors_m.append(_kept((nearest_m - rays.depth_m[0]).abs(), rays.valid[0]))
@@ -107,21 +187,30 @@ def evaluate_rendering(
     baseline = error_summary(_joined(baseline_errors_m))
     result: dict[str, Any] = {
         "checkpoint": str(checkpoint),
+        "root": config.data.root,
+        "split": config.data.split,
         "frames": num_frames - len(skipped),
         "skipped": skipped,
+        "all_returns": all_returns,
         "depth_rays": len(_joined(baseline_errors_m)),
         "semantic_rays": int(scores["trained"].predictions.sum()),
         "semantic_rays_by_class": {
             CLASS_NAMES[k]: int(count) for k, count in enumerate(scores["trained"].predictions.sum(axis=1)) if count
         },
+        "returns_by_class": {
+            group: confusion.count_by_class() for group, confusion in scores["trained"].returns.items()
+        },
         **{name: score.summary() for name, score in scores.items()},
         "nearest_visible": baseline,
+        "projected_label": {"returns": {group: confusion.summary() for group, confusion in projected.items()}},
         "environment": environment(),
     }
     for name in networks:
         result[name]["depth_mean_over_nearest_visible"] = _ratio(result[name]["depth_mean_m"], baseline["depth_mean_m"])
     write_json(folder.path / "evaluation_rendering.json", result)
     progress.console.print(results_table(result))
+    if result["returns_by_class"]:
+        progress.console.print(returns_table(result))
     progress.message(f"written: {folder.path / 'evaluation_rendering.json'}")
     return result
 
@@ -137,14 +226,61 @@ def load_frames(source: FrameSource, num_frames: int, skip_broken: bool, skipped
             skipped[source.token(index)] = str(error)
 
 
+def returns_of(frame: Frame, rows: NDArray[np.int64]) -> Returns | None:
+    """What is known about the returns ``frame.points[rows]``; None where the frame knows no exact classes.
+
+    Raises:
+        FrameError: a pseudo label or a depth map cannot be used.
+    """
+    if frame.semantics is None:
+        return None
+    cameras = [camera for camera in frame.cameras if camera.labels is not None]
+    in_image = np.zeros(len(rows), dtype=bool)
+    class_id = np.full(len(rows), NO_CLASS, dtype=np.int64)
+    occluded = np.zeros(len(rows), dtype=bool)
+    for camera in cameras:
+        assert camera.labels is not None
+        uv, z_depth_m = camera.project(frame.points[rows, :3])
+        new = np.flatnonzero(camera.in_image(uv, z_depth_m) & ~in_image)
+        in_image[new] = True
+        labels = camera.labels.lookup(uv[new]).class_id
+        class_id[new] = np.where(labels < 0, NO_CLASS, labels)
+        if camera.depth is not None:
+            occluded[new] = shows_nearer_surface(z_depth_m[new], camera.depth_at(uv[new]))
+    has_depth = any(camera.depth is not None for camera in cameras)
+    return Returns(
+        merged=merged_classes(frame.semantics[rows]),
+        in_image=in_image,
+        projected=merged_classes(class_id),
+        occluded=occluded if has_depth else None,
+    )
+
+
+def shows_nearer_surface(
+    z_depth_m: NDArray[np.float64],  # [N]
+    image_depth_m: NDArray[np.float64],  # [N], NaN: none
+) -> NDArray[np.bool_]:
+    """[N] mask of returns whose pixel shows a surface before them, by more than `OCCLUSION_TOLERANCE`."""
+    return (z_depth_m > image_depth_m) & ~depths_agree(z_depth_m, image_depth_m, OCCLUSION_TOLERANCE)
+
+
 @torch.no_grad()
-def add_scores(scores: Scores, network: Pretrainer, batch: Batch) -> None:
-    """Render a batch of one frame and add its errors and hits."""
+def add_scores(scores: Scores, network: Pretrainer, batch: Batch, returns: Returns | None = None) -> None:
+    """Render a batch of one frame and add its errors and hits.
+
+    Args:
+        returns: those that the batch's depth rays aim at, in their order.
+    """
     bev = network.encode(batch.points, batch.point_offsets)
     rays = batch.depth
     view = network.render(bev, rays.origins, rays.directions)
     scores.depth_errors_m.append(_kept((view.depth_m - rays.depth_m)[0].abs(), rays.valid[0]))
     scores.opacity_sum += float(view.opacity[rays.valid].sum())
+    if returns is not None:
+        class_id = torch.where(view.opacity > 0, view.semantics.argmax(-1), NO_CLASS)[rays.valid]
+        merged = merged_classes(class_id.cpu().numpy())
+        for group, mask in returns.groups().items():
+            scores.returns[group].add(returns.merged[mask], merged[mask])
     if batch.semantic is not None:
         pixels = batch.semantic
         view = network.render(bev, pixels.origins, pixels.directions)
@@ -181,8 +317,9 @@ def results_table(result: dict[str, Any]) -> Table:
     table = Table(
         title=f"{result['frames']} frame(s), {result['depth_rays']} depth rays, {result['semantic_rays']} camera rays"
     )
-    for column in ("held-out returns", "trained", "untrained", "nearest visible"):
-        table.add_column(column, justify="left" if column.startswith("held") else "right")
+    table.add_column(_kind_of_returns(result))
+    for column in ("trained", "untrained", "nearest visible"):
+        table.add_column(column, justify="right")
     columns = [result[name] for name in ("trained", "untrained", "nearest_visible")]
     for label, key, unit in (
         ("median absolute depth error", "depth_median_m", " m"),
@@ -191,12 +328,31 @@ def results_table(result: dict[str, Any]) -> Table:
         ("mean opacity", "opacity_mean", ""),
     ):
         table.add_row(label, *(_number(column.get(key), unit) for column in columns))
-    table.add_row("semantic accuracy", *(_percent(column.get("semantic_accuracy")) for column in columns))
+    table.add_row("semantic accuracy", *(percent(column.get("semantic_accuracy")) for column in columns))
     table.add_section()
     for name, count in result["semantic_rays_by_class"].items():
         shares = (column.get("semantic_accuracy_by_class", {}).get(name) for column in columns)
-        table.add_row(f"  {name} ({count})", *map(_percent, shares))
+        table.add_row(f"  {name} ({count})", *map(percent, shares))
     return table
+
+
+def returns_table(result: dict[str, Any]) -> Table:
+    """Semantics along the ray from the LiDAR against the true class: trained, untrained, label of the pixel."""
+    table = Table(title="class along the ray from the LiDAR, against the true one")
+    table.add_column(_kind_of_returns(result))
+    for column in ("trained", "untrained", "projected label"):
+        table.add_column(column, justify="right")
+    for group, counts in result["returns_by_class"].items():
+        figures = [result[name]["returns"].get(group, {}) for name in ("trained", "untrained", "projected_label")]
+        table.add_section()
+        for label, key in (("accuracy", "accuracy"), ("mean over classes", "mean_class_accuracy"), ("mIoU", "miou")):
+            name = f"{group.replace('_', ' ')} ({sum(counts.values())}): {label}" if key == "accuracy" else f"  {label}"
+            table.add_row(name, *(percent(figure.get(key)) for figure in figures))
+    return table
+
+
+def _kind_of_returns(result: dict[str, Any]) -> str:
+    return "unseen returns" if result["all_returns"] else "held-out returns"
 
 
 def _kept(values: Tensor, valid: Tensor) -> NDArray[np.float32]:
@@ -216,5 +372,6 @@ def _number(value: float | None, unit: str) -> str:
     return "-" if value is None else f"{value:.3f}{unit}"
 
 
-def _percent(share: float | None) -> str:
+def percent(share: float | None) -> str:
+    """For a table; a dash for nothing."""
     return "-" if share is None else f"{100 * share:.1f} %"

@@ -276,7 +276,8 @@ def pretrain(config: PretrainConfig, resume: bool = False) -> Path:
         if saved_step < total_steps:
             last = make_loader(batches, max(0, total_steps - RECALIBRATION_BATCHES), config.data.workers)
             with autocast:
-                recalibrate_batch_norm(model.module, (batch.to(fabric.device) for batch in last))
+                seen = (batch.to(fabric.device) for batch in last)
+                recalibrate_batch_norm(model.module, ((batch.points, batch.point_offsets) for batch in seen))
             save(total_steps)
         if fabric.is_global_zero:
             export_encoder(folder.encoder, model.module, config, step)
@@ -402,11 +403,15 @@ def latest_checkpoint(
 
 
 @torch.no_grad()
-def recalibrate_batch_norm(model: Pretrainer, batches: Iterable[Batch]) -> None:
+def recalibrate_batch_norm(model: Pretrainer, batches: Iterable[tuple[Tensor, Tensor]]) -> None:
     """Replace the running statistics of the encoder's batch normalisation by those of the final weights.
 
     The running averages (momentum 0.01, as in OpenPCDet) trail the weights by hundreds of steps, which costs a short
     run a tenth of its depth accuracy. A function of weights and batches: doing it again changes nothing.
+
+    Args:
+        model: network.
+        batches: points [N, D] and point_offsets [B + 1] of what the encoder is to see.
     """
     layers = [layer for layer in model.encoder.modules() if isinstance(layer, _BatchNorm)]
     momenta = [layer.momentum for layer in layers]
@@ -415,8 +420,8 @@ def recalibrate_batch_norm(model: Pretrainer, batches: Iterable[Batch]) -> None:
     for layer in layers:
         layer.reset_running_stats()
         layer.momentum = None  # a plain average over the batches
-    for batch in batches:
-        model.encode(batch.points, batch.point_offsets)
+    for points, point_offsets in batches:
+        model.encode(points, point_offsets)
     for layer, momentum in zip(layers, momenta, strict=True):
         layer.momentum = momentum
     model.train(training)

@@ -34,6 +34,7 @@ from typing import Any, NamedTuple
 
 import pred
 from pred.checkpoint import TEMPORARY_SUFFIX, write_text
+from pred.data import index
 from pred.data.world.nuscenes_writer import Part, WorldSettings, write_dataset, write_keyframe
 from pred.data.world.once_layout import once_splits, sequence_name, write_sequence, write_splits
 from pred.progress import Progress, format_duration
@@ -238,7 +239,7 @@ def _claim(out: Path, settings: WorldSettings, work: _Work) -> None:
             raise WorldFolderError(f"{record}: {name} must be {wanted[name]!r} as {source}, got {value!r}")
     if complete:  # other jobs may add to it
         return
-    own = {record.name, ".parts", *work.folders}
+    own = {record.name, ".parts", index.FILE_NAME, *work.folders}
     foreign = [name for name in held if name not in own and not name.endswith(TEMPORARY_SUFFIX)]
     if foreign:
         raise WorldFolderError(f"{out}: must hold nothing but the interrupted world, got {foreign[0]}")

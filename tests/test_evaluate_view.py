@@ -4,22 +4,37 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from PIL import Image
 from tiny_run import tiny_config
 from torch import Tensor
 
 from pred import cli
-from pred.data.batch import TrainingBatches, build_source, evaluation_batch
-from pred.data.frame import CLASS_NAMES, Boxes, Frame
+from pred.data.batch import TrainingBatches, build_source, evaluation_batch, evaluation_rows
+from pred.data.frame import CLASS_NAMES, Boxes, Camera, Frame, inside_range, outside_ego_box
+from pred.data.image_depth import DepthMap
+from pred.data.labels import PseudoLabel
+from pred.data.lidarseg import MERGED_NAMES
 from pred.data.masking import is_held_out
 from pred.data.world import StreetFrames
-from pred.evaluate import Scores, add_scores, error_summary, evaluate_rendering, range_of_nearest_visible, results_table
+from pred.evaluate import (
+    Confusion,
+    Scores,
+    add_scores,
+    error_summary,
+    evaluate_rendering,
+    range_of_nearest_visible,
+    results_table,
+    returns_of,
+    shows_nearer_surface,
+)
 from pred.models.pretrainer import Pretrainer, RenderedView
 from pred.pretrain import PretrainConfig, pretrain
 from pred.view import (
@@ -158,7 +173,7 @@ def test_nothing_to_measure_gives_none_and_no_warning() -> None:
     assert error_summary(np.zeros(0, np.float32)) == {"depth_median_m": None, "depth_mean_m": None}
     result = {
         "frames": 1, "depth_rays": 0, "semantic_rays": 0, "semantic_rays_by_class": {}, "nearest_visible": {},
-        "trained": empty, "untrained": empty,
+        "returns_by_class": {}, "projected_label": {}, "all_returns": False, "trained": empty, "untrained": empty,
     }  # fmt: skip
     assert results_table(result).row_count == 5
 
@@ -196,6 +211,97 @@ def test_broken_frames_are_skipped_on_request(config: PretrainConfig, monkeypatc
     assert result["frames"] == 1 and result["skipped"] == {
         "street-0-000000": "sweep.bin: must hold points, got 3 bytes"
     }
+
+
+# True classes of returns
+
+
+def test_pixels_that_show_a_nearer_surface() -> None:
+    z_depth_m = np.array([10.0, 10.0, 10.0, 10.0, 10.0])
+    # Nearer by more than 0.5 m + 2 % of what the image shows: 9.3 + 0.5 + 0.186 < 10, 9.4 + 0.5 + 0.188 > 10.
+    image_depth_m = np.array([9.3, 9.4, 2.0, 30.0, np.nan])
+    assert shows_nearer_surface(z_depth_m, image_depth_m).tolist() == [True, False, True, False, False]
+
+
+def test_confusion_by_hand() -> None:
+    confusion = Confusion()
+    names = {name: k for k, name in enumerate(MERGED_NAMES)}
+    road, car = names["road"], names["car"]
+    true = np.array([road, road, road, road, car, car, -1, -1])
+    predicted = np.array([road, road, car, -1, car, names["bus"], road, -1])
+    confusion.add(true, predicted)
+    assert confusion.count_by_class() == {"road": 4, "car": 2}
+    summary = confusion.summary()
+    assert summary["accuracy"] == 0.5 and summary["mean_class_accuracy"] == 0.5
+    # Intersections 2 and 1, unions 4 and 2 + 1: what is called a bus is missing, without a class of its own.
+    assert summary["iou_by_class"] == pytest.approx({"road": 0.5, "car": 1 / 3})
+    assert summary["miou"] == pytest.approx(5 / 12)
+    assert Confusion().summary()["miou"] is None
+
+
+def test_pixels_of_returns_by_hand(tmp_path: Path) -> None:
+    """A camera at the LiDAR that looks along +x; a second one that looks the same way comes too late."""
+    T_camera_from_lidar = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
+    intrinsics = np.array([[10.0, 0, 10], [0, 10.0, 5], [0, 0, 1]])
+    depth_m = np.full((10, 20), 20.0)
+    depth_m[:, :10] = 5.0  # a wall on the left
+    Image.fromarray((depth_m * 256).astype(np.uint16)).save(tmp_path / "depth.png")
+    labels = np.full((10, 20), CLASS_NAMES.index("road"), dtype=np.uint8)
+    labels[:, :10] = CLASS_NAMES.index("wall")
+    labels[0] = 255
+
+    def camera(label_map: NDArray[np.uint8]) -> Camera:
+        return Camera(
+            "camera", intrinsics, T_camera_from_lidar, 20, 10,
+            labels=PseudoLabel(label_map, 20, 10), depth=DepthMap(tmp_path / "depth.png", 20, 10),
+        )  # fmt: skip
+
+    xyz = [(10, 5, 0), (5, 2, 0), (10, -5, 0), (10, -5, 4.5), (-10, 0, 0), (10, 5, 0)]
+    points = np.zeros((6, 5), dtype=np.float32)
+    points[:, :3] = np.array(xyz)
+    names = ["car", "wall", "road", "vegetation", "car", None]
+    semantics = np.array([255 if name is None else CLASS_NAMES.index(name) for name in names])
+    cameras = [camera(labels), camera(np.zeros_like(labels))]
+    frame = Frame("token", points, np.arange(6), np.ones(6, dtype=bool), cameras, semantics=semantics)
+    found = returns_of(frame, np.arange(6))
+    assert found is not None and found.occluded is not None
+    merged = {name: k for k, name in enumerate(MERGED_NAMES)}
+    manmade, road, car = merged["manmade"], merged["road"], merged["car"]
+    assert found.merged.tolist() == [car, manmade, road, merged["vegetation"], car, -1]
+    assert found.in_image.tolist() == [True, True, True, True, False, True]
+    assert found.occluded.tolist() == [True, False, False, False, False, True]
+    assert found.projected[:3].tolist() == [manmade, manmade, road]
+    assert found.projected[3] == -1  # no label there
+    assert {name: int(mask.sum()) for name, mask in found.groups().items()} == {"all": 6, "in_image": 5, "occluded": 2}
+    assert returns_of(replace(frame, semantics=None), np.arange(6)) is None
+    without_depth = returns_of(replace(frame, cameras=[replace(cameras[0], depth=None)]), np.arange(6))
+    assert without_depth is not None and set(without_depth.groups()) == {"all", "in_image"}
+
+
+def test_rendered_classes_are_compared_with_the_true_ones(config: PretrainConfig) -> None:
+    """The street knows them, and its labels are exact: pixels are wrong by parallax only."""
+    result = evaluate_rendering(config, run_of(config), max_frames=1)
+    counts = result["returns_by_class"]
+    assert set(counts) == {"all", "in_image"} and sum(counts["all"].values()) <= result["depth_rays"]
+    assert set(result["projected_label"]["returns"]) == {"in_image"}
+    assert result["projected_label"]["returns"]["in_image"]["accuracy"] > 0.8
+    for name in ("trained", "untrained"):
+        assert set(result[name]["returns"]) == set(counts)
+    assert result["trained"]["returns"]["all"]["accuracy"] > result["untrained"]["returns"]["all"]["accuracy"]
+    more = evaluate_rendering(config, run_of(config), max_frames=1, all_returns=True)
+    assert more["all_returns"] and more["depth_rays"] > 5 * result["depth_rays"]
+
+
+def test_all_returns_are_those_that_are_not_visible(config: PretrainConfig) -> None:
+    frame = build_source(config.data).load(0)
+    held_out = evaluation_rows(frame, config.data, config.point_range, seed=0)
+    every = evaluation_rows(frame, config.data, config.point_range, seed=0, all_returns=True)
+    assert (every.visible == held_out.visible).all()
+    assert not set(every.visible) & set(every.returns) and set(held_out.returns) < set(every.returns)
+    inside = inside_range(frame.points, config.point_range) & outside_ego_box(frame.points, config.data.ego_box)
+    inside &= np.linalg.norm(frame.points[:, :3], axis=1) > 1.0
+    expected = set(np.flatnonzero(inside & frame.is_keyframe)) - set(every.visible)
+    assert set(every.returns) == expected
 
 
 # Pictures

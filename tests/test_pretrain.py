@@ -467,7 +467,7 @@ def test_batch_norm_statistics_are_those_of_the_final_weights(finished: Path) ->
     # Doing it again changes nothing, and the momentum is back.
     before = {name: value.clone() for name, value in load_model(config, RunFolder(finished))[0].state_dict().items()}
     network, _ = load_model(config, RunFolder(finished))
-    recalibrate_batch_norm(network, (batches[step] for step in range(12)))
+    recalibrate_batch_norm(network, ((batches[step].points, batches[step].point_offsets) for step in range(12)))
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
     assert not network.training and norm.momentum == 0.01
 

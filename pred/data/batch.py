@@ -33,6 +33,8 @@ from pred.data.rays import (
     draw_uniform,
     frame_candidates,
     join_cameras,
+    point_use,
+    ray_candidates,
 )
 from pred.data.world import StreetConfig
 from pred.random import numpy_generator
@@ -377,8 +379,8 @@ def make_loader(dataset: TrainingBatches, start_step: int = 0, workers: int = 0)
     return _Loader(dataset, range(start_step, len(dataset)), workers)
 
 
-def build_source(config: DataConfig) -> FrameSource:
-    """The frames that ``config`` names.
+def build_source(config: DataConfig, point_classes: bool = False) -> FrameSource:
+    """The frames that ``config`` names, for evaluation with the exact classes of points where the data set has any.
 
     Raises:
         FrameError, ValueError: they cannot be found.
@@ -422,6 +424,7 @@ def build_source(config: DataConfig) -> FrameSource:
         ego_box=config.ego_box,
         info=config.info,
         image_depth=config.image_depth,
+        point_classes=point_classes,
     )
 
 
@@ -444,32 +447,75 @@ def count_classes(
     return counts
 
 
-def evaluation_batch(
-    frame: Frame, config: DataConfig, point_range: PointRange, seed: int, near_m: float = NEAR_M
-) -> Batch:
-    """Batch of one frame whose rays aim at all held-out returns, each once.
+class EvaluationRows(NamedTuple):
+    """What the evaluation of one frame sees and aims at.
 
-    The visible points are a fixed mask of ``seed`` and the frame, of the run's own strategy and ratio: what the encoder
-    was trained to see. Whatever views and filter the run trains with, depth rays are those of the LiDAR view and
-    semantic rays those of the cameras; a return that two cameras see gives two. Jitter is 0.5 (no randomness).
+    Attributes:
+        visible: [N] int64 rows of ``Frame.points`` that the encoder sees.
+        returns: [R] int64 rows that rays aim at; none of them is visible.
+    """
+
+    visible: NDArray[np.int64]
+    returns: NDArray[np.int64]
+
+
+def evaluation_rows(
+    frame: Frame,
+    config: DataConfig,
+    point_range: PointRange,
+    seed: int,
+    near_m: float = NEAR_M,
+    all_returns: bool = False,
+) -> EvaluationRows:
+    """A fixed mask of ``seed`` and the frame, of the run's own strategy and ratio: what the encoder was trained to see;
+    and the held-out returns farther than ``near_m``.
+
+    Args:
+        all_returns: aim at every return of the keyframe that is not visible. On frames of the training that is no test.
+    """
+    use = point_use(frame, point_range, config.ego_box, config.holdout_fraction)
+    candidates = np.flatnonzero(use.input)
+    rng = numpy_generator(seed, frame.token, "evaluation mask")
+    visible = candidates[_visible(frame.points[candidates], config, point_range, rng)]
+    aimed_at = use.held_out
+    if all_returns:
+        aimed_at = use.held_out | use.targets
+        aimed_at[visible] = False
+    returns = np.flatnonzero(aimed_at)
+    far = np.linalg.norm(frame.points[returns, :3].astype(np.float64), axis=1) > near_m
+    return EvaluationRows(visible, returns[far])
+
+
+def evaluation_batch(
+    frame: Frame,
+    config: DataConfig,
+    point_range: PointRange,
+    seed: int,
+    near_m: float = NEAR_M,
+    rows: EvaluationRows | None = None,
+) -> Batch:
+    """Batch of one frame with what `evaluation_rows` gives, or the given rows: visible points, and a depth ray to each
+    return, in order.
+
+    Whatever views and filter the run trains with, depth rays are those of the LiDAR view and semantic rays those of the
+    cameras; a return that two cameras see gives two. Jitter is 0.5 (no randomness).
 
     Raises:
         FrameError: a pseudo label cannot be used.
     """
-    views = replace(config, depth_view="lidar", semantic_view="camera", depth_filter=None)
-    candidates = _candidates(frame, views, point_range, near_m, held_out=True)
-    rng = numpy_generator(seed, frame.token, "evaluation mask")
-    visible = _visible(candidates.points, config, point_range, rng)
-    semantic = join_cameras(candidates.semantic)
+    if rows is None:
+        rows = evaluation_rows(frame, config, point_range, seed, near_m)
+    depth, cameras = ray_candidates(frame.points[rows.returns, :3].astype(np.float64), frame.cameras, near_m)
+    semantic = join_cameras(cameras)
     draw = _Draw(
         token=frame.token,
-        points=candidates.points[visible],
-        depth=candidates.depth,
-        depth_jitter=np.full(len(candidates.depth.depth_m), 0.5, dtype=np.float32),
+        points=frame.points[rows.visible],
+        depth=depth,
+        depth_jitter=np.full(len(depth.depth_m), 0.5, dtype=np.float32),
         semantic=semantic,
         semantic_jitter=np.full(len(semantic.class_id), 0.5, dtype=np.float32),
     )
-    has_labels = len(candidates.semantic) > 0
+    has_labels = len(cameras) > 0
     # At least one ray, so that a frame without held-out returns needs no special case later.
     return _collate(
         step=0,
@@ -513,16 +559,13 @@ class _Draw(NamedTuple):
     semantic_jitter: NDArray[np.float32]
 
 
-def _candidates(
-    frame: Frame, config: DataConfig, point_range: PointRange, near_m: float, held_out: bool = False
-) -> FrameCandidates:
+def _candidates(frame: Frame, config: DataConfig, point_range: PointRange, near_m: float) -> FrameCandidates:
     return frame_candidates(
         frame,
         point_range,
         config.ego_box,
         config.holdout_fraction,
         depth_view=config.depth_view,
-        held_out=held_out,
         near_m=near_m,
         semantic_view=config.semantic_view,
         depth_filter=config.depth_filter,

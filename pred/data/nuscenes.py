@@ -46,7 +46,8 @@ from pred.data.index import (
 )
 from pred.data.info_files import load_info
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
-from pred.data.sweeps import Sweep, accumulate, check_points_size, read_points, require_finite_points
+from pred.data.lidarseg import NO_CLASS, class_files, class_ids_of_categories, read_point_classes
+from pred.data.sweeps import Accumulated, Sweep, accumulate, check_points_size, read_points, require_finite_points
 from pred.data.tables import Report, Row, raise_problem, read_json, read_table, reading_progress
 
 LIDAR_CHANNEL = "LIDAR_TOP"
@@ -82,6 +83,8 @@ class NuScenesFrames(IndexedFrames):
         info: info file of OpenPCDet or mmdetection3d; its samples, in its order, are the frames.
         image_depth: folder under `root` with depth maps ``<CAMERA>/<image stem>.png`` (`pred.data.image_depth`), read
             when asked for; None or "none": no depth.
+        point_classes: fill `Frame.semantics` of the keyframe's own returns, if the version has a lidarseg.json
+            (`pred.data.lidarseg`). For evaluation; training reads none of it.
 
     Raises:
         FrameError: a table is missing or damaged, a folder cannot be found, or the info file does not fit the tables.
@@ -98,6 +101,7 @@ class NuScenesFrames(IndexedFrames):
         ego_box: tuple[float, float, float, float] = (-1.0, -2.0, 1.0, 3.0),
         info: str | Path | None = None,
         image_depth: str | None = None,
+        point_classes: bool = False,
     ) -> None:
         if split is not None and info is not None:
             raise ValueError(f"data.split must not be given with data.info, which selects the frames, got {split!r}")
@@ -107,6 +111,9 @@ class NuScenesFrames(IndexedFrames):
         self.ego_box = ego_box
         self.labels = label_folder(self.root, labels)
         self.depth = depth_folder(self.root, image_depth)
+        self._class_files: dict[str, str] | None = None
+        if point_classes and (self.tables / "lidarseg.json").exists():
+            self._class_files, self._class_ids = class_files(self.tables), class_ids_of_categories(self.tables)
         self._index = self._open_index()
         self._rows = self._select(split) if info is None else self._select_infos(Path(info))
 
@@ -131,6 +138,7 @@ class NuScenesFrames(IndexedFrames):
             cameras=[self._camera(image, T_world_from_lidar) for image in images],
             T_world_from_lidar=T_world_from_lidar,
             source=str(self._file(self._index.sweeps, keyframe)),
+            semantics=None if self._class_files is None else self._point_classes(keyframe, sweeps, self._class_files),
             boxes=self._boxes(row, T_world_from_lidar),
         )
 
@@ -195,6 +203,17 @@ class NuScenesFrames(IndexedFrames):
             row = int(sweeps.previous[row])
             if row < 0:
                 return
+
+    def _point_classes(self, keyframe: int, sweeps: Accumulated, files: dict[str, str]) -> NDArray[np.int64]:
+        """[N] classes of the keyframe's own returns; no other has one."""
+        sweep_file = str(self._index.sweeps.path[keyframe])
+        if sweep_file not in files:
+            raise FrameError(self.tables / "lidarseg.json", f"table must have a row for {sweep_file}, got none")
+        num_points = self._file(self._index.sweeps, keyframe).stat().st_size // (4 * len(SWEEP_COLUMNS))
+        classes = read_point_classes(self.root / files[sweep_file], num_points, self._class_ids)
+        semantics = np.full(len(sweeps.points), NO_CLASS, dtype=np.int64)
+        semantics[sweeps.is_keyframe] = classes[sweeps.point_index[sweeps.is_keyframe]]
+        return semantics
 
     def _camera(self, row: int, T_world_from_lidar: NDArray[np.float64]) -> Camera:
         images = self._index.images

@@ -71,7 +71,7 @@ class SemanticCandidates(NamedTuple):
 
 @dataclass
 class FrameCandidates:
-    """What a frame offers to one purpose, training or evaluation; free of randomness.
+    """What a frame offers to training; free of randomness.
 
     Attributes:
         token: frame token.
@@ -90,18 +90,46 @@ class FrameCandidates:
         return np.bincount(join_cameras(self.semantic).class_id, minlength=NUM_CLASSES)
 
 
+class PointUse(NamedTuple):
+    """What each point of a frame may serve for.
+
+    Attributes:
+        input: [N] bool, the encoder may see it.
+        targets: [N] bool, a return of the keyframe that training may aim at.
+        held_out: [N] bool, a return of the keyframe that only evaluation may aim at.
+    """
+
+    input: NDArray[np.bool_]
+    targets: NDArray[np.bool_]
+    held_out: NDArray[np.bool_]
+
+
+def point_use(
+    frame: Frame, point_range: tuple[float, ...], ego_box: tuple[float, ...], holdout_fraction: float
+) -> PointUse:
+    """Split a frame's points; arguments as in `frame_candidates`."""
+    held = frame.is_keyframe & is_held_out(frame.point_index, frame.token, holdout_fraction)
+    hidden = held.copy()
+    for token, rows in frame.earlier_keyframes.items():
+        hidden[rows] = is_held_out(frame.point_index[rows], token, holdout_fraction)
+    # Sweep points may lie where the own car is now: it has moved since.
+    own_car = frame.is_keyframe & ~outside_ego_box(frame.points, ego_box)
+    inside = inside_range(frame.points, point_range) & ~own_car
+    returns = inside & frame.is_keyframe
+    return PointUse(input=inside & ~hidden, targets=returns & ~held, held_out=returns & held)
+
+
 def frame_candidates(
     frame: Frame,
     point_range: tuple[float, ...],
     ego_box: tuple[float, ...],
     holdout_fraction: float,
     depth_view: DepthView = "lidar",
-    held_out: bool = False,
     near_m: float = NEAR_M,
     semantic_view: SemanticView = "camera",
     depth_filter: DepthTolerance | None = None,
 ) -> FrameCandidates:
-    """Split a frame into what the encoder may see and what rays may aim at.
+    """Split a frame into what the encoder may see and what training rays may aim at.
 
     Args:
         frame: the frame.
@@ -109,7 +137,6 @@ def frame_candidates(
         ego_box: (x_min, y_min, x_max, y_max), metres, LiDAR frame; applies to keyframe returns.
         holdout_fraction: share of the keyframe returns kept for evaluation.
         depth_view: where depth rays start.
-        held_out: False: rays for training; True: rays towards the held-out returns.
         near_m: rays are rendered from this distance on, so nearer returns are no targets, metres.
         semantic_view: where semantic rays start. A return that several cameras see gives one ray for each of them in
             which it has a label.
@@ -119,29 +146,30 @@ def frame_candidates(
     Raises:
         FrameError: a pseudo label or a depth map cannot be used.
     """
-    held = frame.is_keyframe & is_held_out(frame.point_index, frame.token, holdout_fraction)
-    hidden = held.copy()
-    for token, rows in frame.earlier_keyframes.items():
-        hidden[rows] = is_held_out(frame.point_index[rows], token, holdout_fraction)
-    # Sweep points may lie where the own car is now: it has moved since.
-    own_car = frame.is_keyframe & ~outside_ego_box(frame.points, ego_box)
-    inside = inside_range(frame.points, point_range) & ~own_car
-    aimed_at = inside & frame.is_keyframe & (held if held_out else ~held)
-    returns = frame.points[aimed_at, :3].astype(np.float64)
+    use = point_use(frame, point_range, ego_box, holdout_fraction)
+    returns = frame.points[use.targets, :3].astype(np.float64)
+    depth, semantic = ray_candidates(returns, frame.cameras, near_m, depth_view, semantic_view, depth_filter)
+    return FrameCandidates(frame.token, frame.points[use.input], depth, semantic)
+
+
+def ray_candidates(
+    returns: NDArray[np.float64],  # [N, 3] metres, LiDAR frame
+    cameras: list[Camera],
+    near_m: float = NEAR_M,
+    depth_view: DepthView = "lidar",
+    semantic_view: SemanticView = "camera",
+    depth_filter: DepthTolerance | None = None,
+) -> tuple[DepthCandidates, list[SemanticCandidates]]:
+    """Depth rays towards returns, and semantic rays of each camera with a pseudo label; as `frame_candidates`."""
     if depth_view == "lidar":
         depth = _lidar_view(returns, near_m)
     else:
-        depth = _image_view(returns, frame.cameras, near_m)
-    return FrameCandidates(
-        token=frame.token,
-        points=frame.points[inside & ~hidden],
-        depth=depth,
-        semantic=[
-            _semantic(returns, camera, near_m, semantic_view, depth_filter)
-            for camera in frame.cameras
-            if camera.labels is not None
-        ],
-    )
+        depth = _image_view(returns, cameras, near_m)
+    return depth, [
+        _semantic(returns, camera, near_m, semantic_view, depth_filter)
+        for camera in cameras
+        if camera.labels is not None
+    ]
 
 
 def _lidar_view(returns: NDArray[np.float64], near_m: float) -> DepthCandidates:

@@ -15,7 +15,17 @@ from pred.data.frame import Camera, Frame, FrameError
 from pred.data.image_depth import DepthMap
 from pred.data.labels import PseudoLabel
 from pred.data.masking import is_held_out
-from pred.data.rays import DepthView, SemanticView, depths_agree, draw_class_balanced, draw_uniform, frame_candidates
+from pred.data.rays import (
+    DepthView,
+    FrameCandidates,
+    SemanticView,
+    depths_agree,
+    draw_class_balanced,
+    draw_uniform,
+    frame_candidates,
+    point_use,
+    ray_candidates,
+)
 from pred.random import numpy_generator
 
 POINT_RANGE = (-20.0, -20.0, -3.0, 20.0, 20.0, 3.0)
@@ -86,7 +96,9 @@ def test_held_out_returns_are_in_nothing_but_the_held_out_set() -> None:
     frame = make_frame(random_xyz(), np.full((25, 50), 8, dtype=np.uint8))
     held = is_held_out(frame.point_index, "t", 0.1)
     training = frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.1)
-    evaluation = frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.1, held_out=True)
+    use = point_use(frame, POINT_RANGE, EGO_BOX, 0.1)
+    rays = ray_candidates(frame.points[use.held_out, :3].astype(np.float64), frame.cameras)
+    evaluation = FrameCandidates("t", frame.points[use.input], *rays)
     everything = frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.0)
 
     def returns(candidates_points: NDArray[np.float32]) -> set[bytes]:
@@ -121,9 +133,8 @@ def test_sweep_points_are_input_only() -> None:
     frame.earlier_keyframes = {"earlier": slice(700, 900)}
     shown = inside.copy()
     shown[200:400] &= ~is_held_out(frame.point_index[700:900], "earlier", 0.5)
-    for held_out in (False, True):
-        found = frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.5, held_out=held_out)
-        assert np.array_equal(found.points, np.concatenate([expected.points, frame.points[500:][shown]]))
+    found = frame_candidates(frame, POINT_RANGE, EGO_BOX, 0.5)
+    assert np.array_equal(found.points, np.concatenate([expected.points, frame.points[500:][shown]]))
 
 
 def test_semantic_rays_pass_through_their_returns() -> None:

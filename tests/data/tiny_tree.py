@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from pred.data.world.drive import CATEGORIES
+
 VERSION = "v1.0-test"
 NUM_LANDMARKS = 400
 NUM_EGO_POINTS = 7
@@ -46,6 +48,7 @@ class Tree:
     T_world_from_box: list[Matrix] = field(default_factory=list)
     images: list[dict[str, Path]] = field(default_factory=list)
     labels: list[dict[str, Path]] = field(default_factory=list)
+    class_files: list[Path] = field(default_factory=list)  # per keyframe, see `write_lidarseg`
 
     @property
     def tables(self) -> Path:
@@ -176,6 +179,27 @@ def write_tree(root: Path, scenes: tuple[str, ...] = ("scene-a",), keyframes: in
     splits = {"first": list(scenes[:half]), "second": list(scenes[half:])}
     (root / VERSION / "splits.json").write_text(json.dumps(splits))
     return tree
+
+
+def write_lidarseg(tree: Tree, seed: int = 0) -> None:
+    """Random point classes of every keyframe, and the official categories with their indices."""
+    rng = np.random.default_rng(seed)
+    tokens = {"human.pedestrian.adult": "category-person", "vehicle.car": "category-car"}
+    categories = [
+        {"token": tokens.get(name, f"category-{index}"), "name": name, "description": "", "index": index}
+        for index, name in enumerate(CATEGORIES)
+    ]
+    (tree.tables / "category.json").write_text(json.dumps(categories))
+    rows = []
+    for path in tree.keyframe_files:
+        token = path.name.removesuffix(".pcd.bin")
+        name = f"lidarseg/{VERSION}/{token}_lidarseg.bin"
+        num_points = path.stat().st_size // 20
+        tree.class_files.append(tree.root / name)
+        tree.class_files[-1].parent.mkdir(parents=True, exist_ok=True)
+        rng.integers(0, len(CATEGORIES), num_points).astype(np.uint8).tofile(tree.class_files[-1])
+        rows.append({"token": token, "sample_data_token": token, "filename": name})
+    (tree.tables / "lidarseg.json").write_text(json.dumps(rows))
 
 
 def _static_tables(scenes: tuple[str, ...]) -> dict[str, list[dict[str, Any]]]:
