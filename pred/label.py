@@ -59,8 +59,6 @@ class LabelConfig:
     def __post_init__(self) -> None:
         if not self.model:
             raise ValueError("model must be a hub id or a folder, got none")
-        if self.data.dataset == "street":
-            raise ValueError("data.dataset must have image files, got street, which has exact labels of its own")
         if self.data.root is None:
             raise ValueError("data.root must name the folder of the data set, got None")
         if self.out is not None and (self.out in ("", ".", "..") or Path(self.out).name != self.out):

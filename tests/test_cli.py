@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 import yaml
-from tiny_run import tiny_config, write_config
 
 from pred import cli, config, doctor
 from pred.config import CONFIG_FOLDER, ConfigError, build, config_names, config_parser, find_config, flatten, plain
 from pred.pretrain import PretrainConfig
+from tests.tiny_run import tiny_config, write_config
 
 
 def parse(*arguments: str) -> PretrainConfig:
@@ -158,7 +158,7 @@ def test_unknown_option_names_the_nearest(
     ("content", "key", "hint"),
     [
         ("data: {roots: x}", "roots", "did you mean data.root?"),
-        ("data: {street: {frame: 3}}", "frame", "did you mean data.street.frames?"),
+        ("encoder: {pilar_size: [1, 1]}", "pilar_size", "did you mean encoder.pillar_size?"),
         ("trains: {lr: 1}", "trains", "did you mean train"),
         ("zzz: 1", "zzz", None),
     ],
@@ -192,11 +192,8 @@ def test_rule_between_fields_is_an_error_in_one_line(capfd: pytest.CaptureFixtur
     assert not (tmp_path / "run").exists()
 
 
-def test_street_labels_are_auto_or_none(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert parse("--config=demo", "--data.dataset=street", "--data.labels=none").data.labels == "none"
-    options = ["--config=demo", "--data.dataset=street", "--data.labels=pseudo/x", "--run", str(tmp_path / "run")]
-    assert cli.main(["pretrain", *options]) == 1
-    assert "data.labels must be auto or none for the street, got 'pseudo/x'" in capfd.readouterr().err
+def test_none_is_a_word_where_text_is_wanted() -> None:
+    assert parse("--data.labels=none").data.labels == "none"
 
 
 def test_traceback_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,7 +209,7 @@ def test_print_config_can_be_read_back(capfd: pytest.CaptureFixture[str], tmp_pa
         assert stopped.value.code == 0
         return capfd.readouterr().out
 
-    first = printed("--config", "demo", "--train.lr", "0.25")
+    first = printed("--config", "world_pillars", "--train.lr", "0.25")
     (tmp_path / "printed.yaml").write_text(first)
     assert "lr: 0.25" in first
     assert printed("--config", str(tmp_path / "printed.yaml")) == first
@@ -236,7 +233,7 @@ def test_bare_names_are_found_from_any_folder(tmp_path: Path, monkeypatch: pytes
 
 def test_unknown_name_lists_the_known_ones(capfd: pytest.CaptureFixture[str]) -> None:
     error = usage_error(capfd, "--config", "nuscenes_tinny")
-    assert "got 'nuscenes_tinny'; did you mean nuscenes_tiny?" in error and "demo, nuscenes_pillars" in error
+    assert "got 'nuscenes_tinny'; did you mean nuscenes_tiny?" in error and "nuscenes_pillars, nuscenes_tiny, " in error
     assert "got 'missing/file.yaml'" in usage_error(capfd, "--config", "missing/file.yaml")
 
 
@@ -291,8 +288,8 @@ def test_nuscenes_pillars_has_the_papers_values() -> None:
         (["view", "started", "--frame", "2"], "frame must be in [0, 2), got 2"),
         (["view", "started", "--columns", "1"], "columns must be at least 2, got 1"),
         (["evaluate", "rendering", "started", "--frames", "0"], "frames must be at least 1, got 0"),
-        (["evaluate", "rendering", "started", "--data.dataset", "nuscenes"], "data.root must name the folder"),
-        (["evaluate", "rendering", "started", "--data.dataset", "nuscenes", "--data.root", "no_data"], "no_data"),
+        (["evaluate", "rendering", "started", "--data.root", "null"], "data.root must name the folder"),
+        (["evaluate", "rendering", "started", "--data.root", "no_data"], "no_data"),
     ],
 )
 def test_missing_things_are_named(

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from tiny_run import tiny_config
 
 from pred import cli
+from pred.data.batch import DataConfig
 from pred.data.frame import CLASS_NAMES, Frame, FrameError
 from pred.data.lidarseg import MERGED_NAMES, NUM_MERGED
 from pred.evaluate_probe import Cells, draw_cells, evaluate_probe, features_at, fit_probe, labelled_cells
 from pred.pretrain import PretrainConfig, pretrain
 from tests.data.tiny_tree import Tree, write_lidarseg, write_tree
+from tests.tiny_run import tiny_config
 
 POINT_RANGE = (0.0, -2.0, -1.0, 4.0, 2.0, 1.0)
 
@@ -112,7 +114,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Tree:
 @pytest.fixture(scope="module")
 def config(tree: Tree, tmp_path_factory: pytest.TempPathFactory) -> PretrainConfig:
     config = tiny_config(tmp_path_factory.mktemp("runs") / "run", steps=3)
-    config.data.dataset, config.data.root, config.data.split = "nuscenes", str(tree.root), "first"
+    config.data.root, config.data.split = str(tree.root), "first"
     pretrain(config)
     return config
 
@@ -149,8 +151,8 @@ def test_wrong_arguments_of_the_probe(config: PretrainConfig, tree: Tree, tmp_pa
         evaluate_probe(config, run, cells_per_frame=0)
     with pytest.raises(ValueError, match=r"data\.split must select samples of .*, got none: train"):
         evaluate_probe(config, run)
-    with pytest.raises(ValueError, match=r"data\.dataset must be nuscenes, with splits, got street"):
-        evaluate_probe(tiny_config(tmp_path), run)
+    with pytest.raises(ValueError, match=r"data\.dataset must be nuscenes, with splits, got folder"):
+        evaluate_probe(replace(config, data=DataConfig(dataset="folder", root=str(tmp_path))), run)
     table = tree.tables / "lidarseg.json"
     moved = table.rename(tmp_path / "lidarseg.json")
     try:

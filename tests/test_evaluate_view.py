@@ -13,7 +13,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from tiny_run import tiny_config
 from torch import Tensor
 
 from pred import cli
@@ -23,7 +22,7 @@ from pred.data.image_depth import DepthMap
 from pred.data.labels import PseudoLabel
 from pred.data.lidarseg import MERGED_NAMES
 from pred.data.masking import is_held_out
-from pred.data.world import StreetFrames
+from pred.data.nuscenes import NuScenesFrames
 from pred.evaluate import (
     Confusion,
     Scores,
@@ -55,6 +54,7 @@ from pred.view import (
     view,
 )
 from tests.data.tiny_tree import write_tree
+from tests.tiny_run import tiny_config
 
 
 @pytest.fixture(scope="module")
@@ -196,20 +196,20 @@ def test_rays_nearer_than_near_m_are_not_evaluated(config: PretrainConfig, monke
 def test_broken_frames_are_skipped_on_request(config: PretrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     from pred.data.frame import FrameError
 
-    load = StreetFrames.load
+    load = NuScenesFrames.load
 
-    def load_but_the_first(self: StreetFrames, index: int) -> Frame:
+    def load_but_the_first(self: NuScenesFrames, index: int) -> Frame:
         if index == 0:
             raise FrameError("sweep.bin", "must hold points, got 3 bytes")
         return load(self, index)
 
-    monkeypatch.setattr(StreetFrames, "load", load_but_the_first)
+    monkeypatch.setattr(NuScenesFrames, "load", load_but_the_first)
     with pytest.raises(FrameError, match=r"sweep\.bin: must hold points"):
         evaluate_rendering(config, run_of(config))
     monkeypatch.setattr(config.data, "on_error", "skip")
     result = evaluate_rendering(config, run_of(config))
     assert result["frames"] == 1 and result["skipped"] == {
-        "street-0-000000": "sweep.bin: must hold points, got 3 bytes"
+        build_source(config.data).token(0): "sweep.bin: must hold points, got 3 bytes"
     }
 
 
@@ -279,7 +279,7 @@ def test_pixels_of_returns_by_hand(tmp_path: Path) -> None:
 
 
 def test_rendered_classes_are_compared_with_the_true_ones(config: PretrainConfig) -> None:
-    """The street knows them, and its labels are exact: pixels are wrong by parallax only."""
+    """A made world knows them, and its labels are exact: pixels are wrong by parallax only."""
     result = evaluate_rendering(config, run_of(config), max_frames=1)
     counts = result["returns_by_class"]
     assert set(counts) == {"all", "in_image"} and sum(counts["all"].values()) <= result["depth_rays"]
@@ -331,7 +331,7 @@ def test_lidar_only_view_without_image_files(tmp_path: Path, monkeypatch: pytest
     for image in (image for images in tree.images for image in images.values()):
         image.unlink()
     config = tiny_config(tmp_path / "run", steps=1)
-    config.data.dataset, config.data.root, config.data.labels = "nuscenes", str(tree.root), "none"
+    config.data.root, config.data.labels = str(tree.root), "none"
     pretrain(config)
     texts = []
 
@@ -375,10 +375,11 @@ def test_cells_near_a_return() -> None:
 
 
 def test_only_what_was_taught_is_bright(config: PretrainConfig) -> None:
-    """The panel of a real picture: sky over the street, above the LiDAR's view, is dim; the road is not."""
-    path = view(config, run_of(config), columns=16)[0]
-    with Image.open(path) as picture:
-        distance = np.asarray(picture.crop((656, 436, 1296, 796))).astype(int)
+    """The panel of a real picture: sky and facades above the LiDAR's view are dim; the road is not."""
+    view(config, run_of(config), columns=16)
+    with Image.open(run_of(config) / "pictures" / "000000_CAM_FRONT.png") as picture:
+        # Without the house on the right, whose near corner the LiDAR sees up to the upper edge.
+        distance = np.asarray(picture.crop((656, 436, 1136, 796))).astype(int)
     assert distance[:60].max() < 128 and distance[250:].max() > 200
 
 
@@ -415,7 +416,7 @@ def test_colours_of_classes_opacity_and_signed_distance() -> None:
 
 def test_real_keyframe_is_evaluated_and_viewed(nuscenes_tiny: Path, tmp_path: Path) -> None:
     config = tiny_config(tmp_path / "run", steps=2)
-    config.data.dataset, config.data.root = "nuscenes", str(nuscenes_tiny)
+    config.data.root = str(nuscenes_tiny)
     pretrain(config)
     result = evaluate_rendering(config, run_of(config))
     assert result["depth_rays"] > 1000 and result["semantic_rays"] > 1000

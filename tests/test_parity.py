@@ -12,6 +12,7 @@ from torch import Tensor
 from pred.config import build, config_parser
 from pred.data.batch import TrainingBatches
 from pred.pretrain import PretrainConfig, build_model
+from tests.tiny_run import tiny_world
 
 
 def losses_and_gradients(
@@ -43,8 +44,8 @@ def check(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         assert error <= 1e-3 * max(float(expected.norm()), 1e-3 * largest), name
 
 
-def test_step_on_the_street(native: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    check(["--config=demo", "--data.dataset=street", "--data.street.frames=1", "--data.workers=0"], monkeypatch)
+def test_step_on_a_made_world(native: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    check(["--config=world_pillars", f"--data.root={tiny_world()}", "--data.workers=0"], monkeypatch)
 
 
 def test_step_on_the_real_keyframe(native: None, nuscenes_tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:

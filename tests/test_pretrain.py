@@ -15,18 +15,16 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import docstring_parser
 import pytest
 import torch
-from tiny_run import tiny_config, write_config
 from torch import Tensor
 
 from pred.checkpoint import CheckpointError, list_checkpoints, load_tensors
-from pred.data.batch import DataConfig, TrainingBatches
+from pred.data.batch import DataConfig, TrainingBatches, build_source
 from pred.data.frame import FrameError
-from pred.data.world import StreetConfig
 from pred.losses import LossConfig
 from pred.models.encoders.pillars import PillarEncoderConfig
 from pred.models.field import FieldConfig
@@ -45,6 +43,7 @@ from pred.pretrain import (
 )
 from pred.run_folder import CsvLog, RunFolder, RunFolderError
 from tests.data.tiny_tree import write_tree
+from tests.tiny_run import tiny_config, write_config
 
 
 @pytest.fixture(autouse=True)
@@ -137,7 +136,7 @@ def test_a_folder_that_holds_a_run_is_refused(finished: Path) -> None:
 
 def test_a_data_set_that_cannot_be_read_leaves_no_folder(tmp_path: Path) -> None:
     config = tiny_config(tmp_path / "run")
-    config.data.dataset = "nuscenes"
+    config.data.root = None
     with pytest.raises(ValueError, match=r"data\.root must name the folder"):
         pretrain(config)
     assert not (tmp_path / "run").exists()
@@ -267,30 +266,28 @@ def test_resume_with_another_configuration_names_the_key(finished: Path) -> None
         pretrain(tiny_config(finished, lr=0.01), resume=True)
 
 
-def test_resume_with_another_number_of_frames_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = pretrain(tiny_config(tmp_path / "run", steps=None, epochs=2))
-    from pred.data.world import StreetFrames
-
-    monkeypatch.setattr(StreetFrames, "__len__", lambda self: 3)
+def test_resume_with_another_number_of_frames_is_refused(tmp_path: Path) -> None:
+    config = tiny_config(tmp_path / "run", steps=None, epochs=2)
+    pretrain(config)
+    config.data.root = str(write_tree(tmp_path / "data", keyframes=3).root)
     with pytest.raises(CheckpointError, match="must have the checkpoint's 4 steps, got 6"):
-        pretrain(tiny_config(run, steps=None, epochs=2), resume=True)
+        pretrain(config, resume=True)
 
 
-def test_resume_with_other_frames_is_refused(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pred.data.world import StreetFrames
-
-    monkeypatch.setattr(StreetFrames, "token", lambda self, index: f"other-{index}")
+def test_resume_with_other_frames_is_refused(finished: Path, tmp_path: Path) -> None:
+    config = tiny_config(finished)
+    config.data.root = str(write_tree(tmp_path / "data").root)
     with pytest.raises(
         CheckpointError, match=r"step_.*: frames must be those of the checkpoint, in its order, got others"
     ):
-        pretrain(tiny_config(finished), resume=True)
+        pretrain(config, resume=True)
 
 
 def test_root_and_info_file_may_move(tmp_path: Path) -> None:
     def config(root: Path, info: Path, frames: list[int]) -> PretrainConfig:
         info.write_bytes(pickle.dumps([{"token": tree.tokens[frame]} for frame in frames]))
         found = tiny_config(tmp_path / "run")
-        found.data.dataset, found.data.root, found.data.info = "nuscenes", str(root), str(info)
+        found.data.root, found.data.info = str(root), str(info)
         return found
 
     tree = write_tree(tmp_path / "here")
@@ -355,8 +352,11 @@ def test_non_finite_loss_stops_the_run_and_names_step_frame_and_term(
         return output
 
     monkeypatch.setattr(Pretrainer, "forward", broken_forward)
-    with pytest.raises(NonFiniteLossError, match=rf"{term} = inf, total = nan in step 5, frames street-0-00000[01]"):
-        pretrain(tiny_config(tmp_path / "run"))
+    config = tiny_config(tmp_path / "run")
+    source = build_source(config.data)
+    tokens = f"({source.token(0)}|{source.token(1)})"
+    with pytest.raises(NonFiniteLossError, match=rf"{term} = inf, total = nan in step 5, frames {tokens};"):
+        pretrain(config)
     assert all(torch.isfinite(value).all() for value in weights(tmp_path / "run").values() if value.is_floating_point())
     assert len(read_log(tmp_path / "run")) == 4
 
@@ -381,12 +381,9 @@ def test_bf16_trains_with_weights_in_float32(tmp_path: Path) -> None:
     assert all(math.isfinite(float(row["loss"])) for row in read_log(run))
 
 
-@pytest.mark.parametrize("dataset", ["street", "nuscenes"])
-def test_lidar_only_by_configuration(tmp_path: Path, dataset: Literal["street", "nuscenes"]) -> None:
+def test_lidar_only_by_configuration(tmp_path: Path) -> None:
     config = tiny_config(tmp_path / "run", steps=2)
-    config.data.dataset, config.data.labels = dataset, "none"
-    if dataset == "nuscenes":
-        config.data.root = str(write_tree(tmp_path / "data").root)
+    config.data.labels = "none"
     rows = read_log(pretrain(config))
     assert [row["semantic"] for row in rows] == ["0.0", "0.0"] and float(rows[0]["depth"]) > 0
 
@@ -411,7 +408,7 @@ def test_every_skipped_frame_is_counted(tmp_path: Path) -> None:
     for image in tree.images[1].values():
         image.write_bytes(b"junk")
     config = tiny_config(tmp_path / "run", steps=2)
-    config.data.dataset, config.data.root, config.data.batch_size = "nuscenes", str(tree.root), 4
+    config.data.root, config.data.batch_size = str(tree.root), 4
     with pytest.raises(FrameError, match=f"{tree.images[1]['CAM_BACK']}: image file must be readable"):
         pretrain(config)
     config.run, config.data.on_error = str(tmp_path / "skipping"), "skip"
@@ -544,8 +541,7 @@ def test_csv_log_killed_within_the_header(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "config_class",
     [
-        PretrainConfig, DataConfig, StreetConfig, PillarEncoderConfig, FieldConfig, RendererConfig, LossConfig,
-        TrainConfig,
+        PretrainConfig, DataConfig, PillarEncoderConfig, FieldConfig, RendererConfig, LossConfig, TrainConfig,
     ],
 )  # fmt: skip
 def test_config_classes_document_every_field(config_class: type[Any]) -> None:

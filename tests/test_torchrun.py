@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 
 import torch
-from tiny_run import tiny_config, write_config
 
 from pred.checkpoint import load_tensors
+from tests.tiny_run import tiny_config, write_config
 
 
 def test_two_processes_train_one_model(tmp_path: Path) -> None:

@@ -1,22 +1,38 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""A pre-training run of a second or two on the procedural street, shared by the tests of the jobs."""
+"""A pre-training run of a second or two on a tiny world, shared by the tests of the jobs."""
 
 from __future__ import annotations
 
+import tempfile
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from pred.data.batch import DataConfig
-from pred.data.world import StreetConfig
+from pred.data.world.nuscenes_writer import WorldSettings
 from pred.models.encoders.pillars import PillarEncoderConfig
 from pred.models.field import FieldConfig
 from pred.models.renderer import RendererConfig
 from pred.pretrain import PretrainConfig, TrainConfig
+from pred.world import make_world
 
 POINT_RANGE = (-25.6, -25.6, -3.0, 25.6, 25.6, 3.0)
+WORLD = WorldSettings(scenes=1, keyframes=2, image_scale=0.04, exact_labels=True)
+
+
+@cache
+def _world_folder() -> tempfile.TemporaryDirectory[str]:
+    folder = tempfile.TemporaryDirectory(prefix="pred_tiny_world_")
+    make_world(Path(folder.name), WORLD, workers=1)
+    return folder
+
+
+def tiny_world() -> Path:
+    """Root of two keyframes of a drive, made once per process and gone with it. Nobody may change it."""
+    return Path(_world_folder().name)
 
 
 def tiny_config(run: Path, **train: Any) -> PretrainConfig:
@@ -24,13 +40,13 @@ def tiny_config(run: Path, **train: Any) -> PretrainConfig:
         run=str(run),
         point_range=POINT_RANGE,
         data=DataConfig(
-            dataset="street",
+            root=str(tiny_world()),
+            sweeps=1,
             batch_size=1,
             mask_ratio=0.8,
             semantic_rays_per_camera=8,
             depth_rays=48,
             workers=0,
-            street=StreetConfig(frames=2, frames_per_street=2, image_width=64, image_height=36),
         ),
         encoder=PillarEncoderConfig(
             pillar_size=(0.8, 0.8),

@@ -9,7 +9,7 @@ import math
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -36,7 +36,6 @@ from pred.data.rays import (
     point_use,
     ray_candidates,
 )
-from pred.data.world import StreetConfig
 from pred.random import numpy_generator
 
 PointRange = tuple[float, float, float, float, float, float]
@@ -61,10 +60,10 @@ TensorHolder = TypeVar("TensorHolder", bound="Rays | Batch")
 class DataConfig:
     """What is read, what is hidden from the encoder, and how many rays are drawn."""
 
-    dataset: Literal["street", "nuscenes", "once", "folder"] = "nuscenes"
-    """Procedural street, the official nuScenes or ONCE layout under `root`, or a folder of own drives under `root`."""
+    dataset: Literal["nuscenes", "once", "folder"] = "nuscenes"
+    """What is under `root`: the official nuScenes layout, that of ONCE, or a folder of own drives."""
     root: str | None = None
-    """Folder of the data set (not for the street)."""
+    """Folder of the data set."""
     version: str | None = None
     """Table folder under `root` (nuscenes only); None: the only folder named like v1.0-*."""
     split: str | None = None
@@ -76,7 +75,7 @@ class DataConfig:
     """LiDAR sweeps per frame, the keyframe's own included; fewer where a recording starts (nuscenes, folder)."""
     labels: str | None = "auto"
     """Folder under `root` with <CAMERA>/<image stem>.png|.npy|.npz (ONCE: <sequence>/<camera>/<frame id>.*); auto: the
-    only folder under pseudo/; none (or no such folder): LiDAR-only. The street knows auto (exact labels) and none."""
+    only folder under pseudo/; none (or no such folder): LiDAR-only."""
     image_depth: str | None = None
     """Folder under `root` with depth maps of the images, <CAMERA>/<image stem>.png (nuscenes) or <drive>/<camera>/
     <stem>.png (folder): 16-bit PNG, metres = value / 256, 0 = no depth. None or none: no depth."""
@@ -114,17 +113,13 @@ class DataConfig:
     """Broken frame: stop with an error naming the file, or take the next frame and count it."""
     workers: int = 2
     """Loader processes; 0 loads in the training process."""
-    street: StreetConfig = field(default_factory=StreetConfig)
-    """The procedural street (street only)."""
 
     def __post_init__(self) -> None:
-        if self.dataset != "street" and self.root == "":
+        if self.root == "":
             raise ValueError("data.root must name a folder, got an empty string")
         if self.dataset != "nuscenes" and self.info is not None:
             raise ValueError(f"data.info must be left out for data.dataset {self.dataset}, got {self.info!r}")
-        if self.dataset == "street" and self.labels not in ("auto", "none", None):
-            raise ValueError(f"data.labels must be auto or none for the street, got {self.labels!r}")
-        if self.dataset in ("street", "once") and self.image_depth not in (None, "none"):
+        if self.dataset == "once" and self.image_depth not in (None, "none"):
             raise ValueError(f"data.image_depth must be none for data.dataset {self.dataset}, got {self.image_depth!r}")
         if not (math.isfinite(self.mask_patch_m) and self.mask_patch_m > 0):
             raise ValueError(f"data.mask_patch_m must be positive, got {self.mask_patch_m}")
@@ -385,13 +380,9 @@ def build_source(config: DataConfig, point_classes: bool = False) -> FrameSource
     Raises:
         FrameError, ValueError: they cannot be found.
     """
-    if config.dataset == "street":
-        # Each import brings what the others do not need: a ray caster, Arrow.
-        from pred.data.world import StreetFrames
-
-        return StreetFrames(config.street, labels=config.labels not in ("none", None))
     if config.root is None:
         raise ValueError("data.root must name the folder of the data set, got None")
+    # Each import brings what the others do not need.
     if config.dataset == "once":
         from pred.data.once import OnceFrames
 

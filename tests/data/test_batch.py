@@ -31,9 +31,9 @@ from pred.data.labels import PseudoLabel
 from pred.data.masking import is_held_out
 from pred.data.nuscenes import NuScenesFrames
 from pred.data.rays import NEAR_M, frame_candidates
-from pred.data.world import StreetConfig, StreetFrames
 from pred.models.renderer import RendererConfig
 from tests.data.tiny_tree import NUM_LANDMARKS, Tree, write_tree
+from tests.tiny_run import tiny_world
 
 POINT_RANGE = (-25.0, -25.0, -5.0, 25.0, 25.0, 3.0)
 
@@ -267,12 +267,12 @@ def test_classes_are_balanced_over_the_batch() -> None:
     assert batches._candidates(0).class_counts()[13] < 0.3 * batches._candidates(0).class_counts()[0]
 
 
-class StreetLabels:
-    """The street's frames, with labels made of its exact ones."""
+class WorldLabels:
+    """Frames of the tiny world, with labels made of its exact ones."""
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
-        self.frames = StreetFrames(StreetConfig(frames=2, image_width=160, image_height=90))
+        self.frames = NuScenesFrames(tiny_world(), sweeps=1)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -287,7 +287,8 @@ class StreetLabels:
             classes = camera.labels.class_map()
             if self.kind == "some":
                 classes[::2] = 255
-            camera.labels = PseudoLabel(probabilities(classes) if self.kind == "soft" else classes, 160, 90)
+            label_map = probabilities(classes) if self.kind == "soft" else classes
+            camera.labels = PseudoLabel(label_map, camera.width, camera.height)
         return frame
 
 
@@ -302,10 +303,8 @@ def probabilities(classes: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("class_counts", ["batch", "dataset"])
 @pytest.mark.parametrize("kind", ["hard", "soft", "some"])
 def test_drawn_classes_follow_the_inverse_frequency(kind: str, class_counts: Literal["batch", "dataset"]) -> None:
-    source = StreetLabels(kind)
-    config = DataConfig(
-        dataset="street", batch_size=1, workers=0, semantic_rays_per_camera=1, depth_rays=1, class_counts=class_counts
-    )
+    source = WorldLabels(kind)
+    config = DataConfig(batch_size=1, workers=0, semantic_rays_per_camera=1, depth_rays=1, class_counts=class_counts)
     batches = TrainingBatches(config, POINT_RANGE, seed=0, total_steps=1000, source=source)
     frames = [batches._candidates(index) for index in range(2)]
     per_frame = [frame.class_counts() for frame in frames]
@@ -341,7 +340,7 @@ def test_dataset_class_counts(tree: Tree) -> None:
 def test_to_moves_every_tensor(tree: Tree) -> None:
     batch = TrainingBatches(tree_config(tree), POINT_RANGE, seed=0, total_steps=1)[0].to("meta")
     assert all(tensor.is_meta for tensor in tensors(batch).values())
-    assert len(tensors(batch)) == 2 + 6 + 6
+    assert len(tensors(batch)) == 2 + 6 + 7
 
 
 # Repeatability
@@ -662,10 +661,6 @@ def test_evaluation_batch_with_nothing_held_out() -> None:
         ),
         ({"workers": -1}, r"data\.workers must be at least 0, got -1"),
         ({"ego_box": (1.0, 0.0, -1.0, 0.0)}, r"data\.ego_box must be \(x_min"),
-        (
-            {"dataset": "street", "labels": "pseudo/x"},
-            r"data\.labels must be auto or none for the street, got 'pseudo/x'",
-        ),
     ],
 )
 def test_wrong_settings(changes: dict[str, Any], text: str) -> None:
@@ -680,8 +675,9 @@ def test_sources() -> None:
         small_batches(MemoryFrames([]))
 
 
-def test_street() -> None:
-    config = DataConfig(dataset="street", batch_size=1, workers=0, semantic_rays_per_camera=16, depth_rays=32)
+def test_made_world() -> None:
+    root = str(tiny_world())
+    config = DataConfig(root=root, batch_size=1, workers=0, semantic_rays_per_camera=16, depth_rays=32)
     batch = TrainingBatches(config, POINT_RANGE, seed=0, total_steps=1)[0]
     assert batch.depth.valid.all()
     assert batch.semantic is not None and batch.semantic.valid.all()

@@ -422,6 +422,26 @@ def test_moving_things_are_where_they_were_when_the_beam_met_them(drive: Drive) 
     assert checked > 5
 
 
+def test_ranges_have_2_cm_of_noise(drive: Drive) -> None:
+    still_us = next(int(time_us) for time_us in drive.keyframe_us if ego_speed(drive, int(time_us)) < 1e-9)
+    sweep = drive.scan(still_us)
+    # On a plane the exact range follows from the beam's slope alone, if the sensor stands still.
+    slope = -sensors.lidar_directions()[:, 2]
+    steep = (sweep.class_id == CLASS_IDS["road"]) & (slope > 0.2)
+    error_m = np.linalg.norm(sweep.points[steep, :3].astype(np.float64), axis=1) - 1.84 / slope[steep]
+    # Paint lies 5 mm higher.
+    assert steep.sum() > 3000 and error_m.std() == pytest.approx(0.02, abs=0.002) and abs(error_m.mean()) < 0.004
+
+
+def test_intensity_tells_materials_apart(drive: Drive) -> None:
+    sweeps = [drive.scan(int(time_us)) for time_us in drive.keyframe_us[::8]]
+    intensity = np.concatenate([sweep.points[:, 3] for sweep in sweeps])
+    class_id = np.concatenate([sweep.class_id for sweep in sweeps])
+    assert intensity.min() >= 0 and intensity.max() <= 255
+    signs, all_median = intensity[class_id == CLASS_IDS["traffic sign"]], np.median(intensity[class_id != NO_CLASS])
+    assert len(signs) > 20 and np.median(signs) > 3 * all_median
+
+
 def test_the_ego_car_hides_the_ground_around_it() -> None:
     grid = ego_range_m().reshape(1085, 32)
     hidden = np.isfinite(grid)
@@ -456,6 +476,38 @@ def test_views_agree_with_boxes_at_their_own_time(drive: Drive) -> None:
                 assert in_box(actor, time_us, world[own], margin_m=0.025).all()
                 checked += 1
     assert checked > 40
+
+
+def test_pixels_show_the_classes_of_the_points_that_project_to_them(drive: Drive) -> None:
+    """Pixels of a LiDAR point have its class, but for parallax, pixel size and what moved in between."""
+    points, pixels = np.zeros(256, dtype=int), np.zeros(256, dtype=int)
+    agreeing, visible = [], []
+    for time_us in map(int, drive.keyframe_us[::10]):
+        sweep = drive.scan(time_us)
+        returned = np.flatnonzero((sweep.category != NOISE) & (sweep.category != EGO))
+        points += np.bincount(sweep.class_id[returned], minlength=256)
+        world = in_world(drive, time_us, sweep.points[returned])
+        for mount in sensors.CALIBRATED_MOUNTS:
+            camera_us = time_us + drive.camera_offsets_us[mount.name]
+            view, camera = drive.view(mount, camera_us, 160, 90), sensors.mounted_camera(mount, 160, 90)
+            pixels += np.bincount(view.class_id.ravel(), minlength=256)
+            T_lidar_from_world = invert_rigid(drive.T_world_from_ego(camera_us) @ sensors.T_EGO_FROM_LIDAR)
+            uv, z_depth_m = camera.project(transform_points(T_lidar_from_world, world))
+            inside = camera.in_image(uv, z_depth_m)
+            u, v = uv[inside].astype(int).T
+            agreeing.append(view.class_id[v, u] == sweep.class_id[returned[inside]])
+            visible.append(z_depth_m[inside] < 1.03 * view.depth_m[v, u] + 0.3)
+            sky = view.image[view.class_id == SKY_CLASS].astype(int)
+            assert len(sky) == 0 or ((sky[:, 2] > 180).all() and (sky[:, 2] >= sky[:, 0]).all())
+            assert len(np.unique(view.image.reshape(-1, 3), axis=0)) > 100
+    agree, seen = np.concatenate(agreeing), np.concatenate(visible)
+    assert len(agree) > 80_000
+    assert agree.mean() > 0.92 and agree[seen].mean() > 0.975
+    for name in ("road", "sidewalk", "building", "pole", "vegetation", "terrain", "person", "car"):
+        assert points[CLASS_IDS[name]] > 100 and pixels[CLASS_IDS[name]] > 200, name
+    for name in ("traffic light", "traffic sign"):
+        assert points[CLASS_IDS[name]] > 5 and pixels[CLASS_IDS[name]] > 20, name
+    assert points[SKY_CLASS] == 0 and pixels[SKY_CLASS] > 10_000
 
 
 def test_intrinsics_follow_the_size() -> None:

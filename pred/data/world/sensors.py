@@ -1,10 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""A LiDAR and six cameras modelled on the nuScenes car, looking at a ray-cast scene.
-
-In `scan` nothing moves, all sensors measure at the same time, and there is no ego car; `pred.data.world.drive` has all
-of that.
-"""
+"""A LiDAR and six cameras modelled on the nuScenes car: where they are, and how what they measure follows from hits."""
 
 from __future__ import annotations
 
@@ -16,14 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pred.data.frame import Camera, invert_rigid
-from pred.data.world.scene import Scene
 
 NUM_RINGS, NUM_COLUMNS = 32, 1085
 LOWEST_RING_DEG, HIGHEST_RING_DEG = -30.67, 10.67
 MAX_RANGE_M = 105.0
 RANGE_NOISE_M = 0.02
-DROPOUT = 0.10
-"""Share of the returns that are lost. With the rays that meet the sky, 15 to 20 % of a sweep is missing."""
 MIN_RANGE_M = 0.5
 
 # The LiDAR stands 1.84 m above the road; its x axis points to the car's right, its y axis ahead.
@@ -44,14 +37,6 @@ class Mount(NamedTuple):
     centre_px: tuple[float, float] | None = None
 
 
-MOUNTS = (
-    Mount("CAM_FRONT", 1.70, 0.0, 1.50, 0.0, 1266.0),
-    Mount("CAM_FRONT_RIGHT", 1.55, -0.50, 1.50, -55.0, 1266.0),
-    Mount("CAM_BACK_RIGHT", 1.05, -0.50, 1.55, -110.0, 1266.0),
-    Mount("CAM_BACK", 0.0, 0.0, 1.55, 180.0, 809.0),
-    Mount("CAM_BACK_LEFT", 1.05, 0.50, 1.55, 110.0, 1266.0),
-    Mount("CAM_FRONT_LEFT", 1.55, 0.50, 1.50, 55.0, 1266.0),
-)
 MOUNT_IMAGE_WIDTH, MOUNT_IMAGE_HEIGHT = 1600, 900
 
 CALIBRATED_MOUNTS = (
@@ -62,21 +47,7 @@ CALIBRATED_MOUNTS = (
     Mount("CAM_BACK_LEFT", 1.04, 0.48, 1.59, 108.6, 1257.0, -0.9, (792.0, 493.0)),
     Mount("CAM_FRONT_LEFT", 1.52, 0.49, 1.51, 55.2, 1273.0, 0.1, (827.0, 480.0)),
 )
-"""The calibration of one nuScenes car, rounded; `MOUNTS` is its idealisation."""
-
-
-class Sweep(NamedTuple):
-    """Returns of one LiDAR revolution, column by column.
-
-    Attributes:
-        points: [N, 5] float32: x, y, z in metres (LiDAR frame), intensity (integers 0 to 255), 0.
-        ray_index: [N] int64, column * 32 + ring; ring 0 is the lowest.
-        class_id: [N] uint8, Cityscapes train id of what the beam met.
-    """
-
-    points: NDArray[np.float32]
-    ray_index: NDArray[np.int64]
-    class_id: NDArray[np.uint8]
+"""The calibration of one nuScenes car, rounded."""
 
 
 @lru_cache(maxsize=1)
@@ -89,27 +60,6 @@ def lidar_directions() -> NDArray[np.float64]:
     directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
     directions.flags.writeable = False
     return directions
-
-
-def scan(scene: Scene, T_world_from_lidar: NDArray[np.float64], rng: np.random.Generator) -> Sweep:
-    """One revolution: range noise, drop-outs, intensity by material and angle; misses are left out."""
-    directions = lidar_directions()
-    directions_world = (directions @ T_world_from_lidar[:3, :3].T).astype(np.float32)
-    hits = scene.cast(T_world_from_lidar[:3, 3].astype(np.float32), directions_world)
-    # Drawn for all rays, so that a ray's noise does not depend on what the others meet.
-    noise_m, kept, speckle = (
-        rng.normal(0.0, RANGE_NOISE_M, len(directions)),
-        rng.random(len(directions)) >= DROPOUT,
-        rng.normal(1.0, 0.1, len(directions)),
-    )
-    (ray_index,) = np.nonzero(kept & (hits.t_m > MIN_RANGE_M) & (hits.t_m < MAX_RANGE_M))
-    range_m = hits.t_m[ray_index] + noise_m[ray_index]
-    cosine = -np.einsum("nc,nc->n", hits.normal[ray_index], directions_world[ray_index])
-    returned = returned_light(scene.reflectances[hits.face[ray_index]], cosine, speckle[ray_index])
-    points = np.zeros((len(ray_index), 5), dtype=np.float32)
-    points[:, :3] = directions[ray_index] * range_m[:, None]
-    points[:, 3] = np.rint(255 * returned).clip(0, 255)
-    return Sweep(points, ray_index, hits.class_id[ray_index])
 
 
 def returned_light(
@@ -154,27 +104,6 @@ def camera_rays(
     directions = pixels @ to_world.T
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return T_world_from_camera[:3, 3].astype(np.float32), directions.astype(np.float32)
-
-
-def render_labels(scene: Scene, camera: Camera, T_world_from_lidar: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Exact class of every pixel, uint8 [height, width], Cityscapes train ids including sky."""
-    hits = scene.cast(*camera_rays(camera, T_world_from_lidar))
-    return hits.class_id.reshape(camera.height, camera.width)
-
-
-def render_image(
-    scene: Scene,
-    camera: Camera,
-    T_world_from_lidar: NDArray[np.float64],
-    sun: NDArray[np.float32],  # [3] unit vector towards the sun, world frame
-) -> NDArray[np.uint8]:
-    """Picture, uint8 [height, width, 3]: Lambert shading with cast shadows, haze and a sky gradient."""
-    origin, directions = camera_rays(camera, T_world_from_lidar)
-    hits = scene.cast(origin, directions)
-    (solid,) = np.nonzero(hits.face >= 0)
-    colours = scene.colours[hits.face[solid]]
-    pixels = shade(origin, directions, solid, hits.t_m[solid], hits.normal[solid], colours, sun, scene.occluded)
-    return pixels.reshape(camera.height, camera.width, 3)
 
 
 def shade(
