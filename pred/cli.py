@@ -57,7 +57,7 @@ def evaluate_rendering(arguments: list[str]) -> None:
 
     def add_options(parser: Any) -> None:
         parser.add_argument(
-            "--frames", type=int | None, default=None, help="evaluate only the first frames; all by default"
+            "--frames", type=int | None, default=None, help="so many frames, evenly spread; all by default"
         )
         parser.add_argument(
             "--all-returns", action="store_true", help="every return that is not seen: for frames not trained on"

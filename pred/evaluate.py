@@ -143,7 +143,7 @@ def evaluate_rendering(
         config: the run's configuration; its data set is evaluated.
         run: run folder.
         checkpoint: file to use; the run's latest by default.
-        max_frames: evaluate only the first ones.
+        max_frames: evaluate only so many frames, evenly spread.
         all_returns: aim at every keyframe return that the encoder does not see, held out or not: for frames that
             training never used.
 
@@ -157,7 +157,7 @@ def evaluate_rendering(
         raise ValueError(f"evaluate: frames must be at least 1, got {max_frames}")
     folder = RunFolder(run)
     folder.require()
-    source = build_source(config.data, point_classes=True)
+    source = SpreadFrames(build_source(config.data, point_classes=True), max_frames)
     device = pick_device(config.train)
     trained, checkpoint = load_model(config, folder, checkpoint)
     networks = {"trained": trained.to(device), "untrained": build_model(config).eval().to(device)}
@@ -166,9 +166,8 @@ def evaluate_rendering(
     projected: dict[str, Confusion] = defaultdict(Confusion)
     skipped: dict[str, str] = {}
 
-    num_frames = min(len(source), max_frames or len(source))
-    with Progress("evaluated frame", num_frames) as progress:
-        for frame in load_frames(source, num_frames, config.data.on_error == "skip", skipped):
+    with Progress("evaluated frame", len(source)) as progress:
+        for frame in load_frames(source, config.data.on_error == "skip", skipped):
             seed, near_m = config.train.seed, config.renderer.near_m
             rows = evaluation_rows(frame, config.data, config.point_range, seed, near_m, all_returns)
             batch = evaluation_batch(frame, config.data, config.point_range, seed, near_m, rows).to(device)
@@ -189,7 +188,7 @@ def evaluate_rendering(
         "checkpoint": str(checkpoint),
         "root": config.data.root,
         "split": config.data.split,
-        "frames": num_frames - len(skipped),
+        "frames": len(source) - len(skipped),
         "skipped": skipped,
         "all_returns": all_returns,
         "depth_rays": len(_joined(baseline_errors_m)),
@@ -215,9 +214,27 @@ def evaluate_rendering(
     return result
 
 
-def load_frames(source: FrameSource, num_frames: int, skip_broken: bool, skipped: dict[str, str]) -> Iterator[Frame]:
-    """The first frames of a source; broken ones raise, or are left out and noted in ``skipped``."""
-    for index in range(num_frames):
+class SpreadFrames:
+    """At most ``num_frames`` frames of a source, evenly spread; all of them if that is None."""
+
+    def __init__(self, source: FrameSource, num_frames: int | None) -> None:
+        self._source = source
+        chosen = min(len(source), num_frames or len(source))
+        self._rows = [position * len(source) // chosen for position in range(chosen)]
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def token(self, index: int) -> str:
+        return self._source.token(self._rows[index])
+
+    def load(self, index: int) -> Frame:
+        return self._source.load(self._rows[index])
+
+
+def load_frames(source: FrameSource, skip_broken: bool, skipped: dict[str, str]) -> Iterator[Frame]:
+    """Frames of a source; broken ones raise, or are left out and noted in ``skipped``."""
+    for index in range(len(source)):
         try:
             yield source.load(index)
         except FrameError as error:

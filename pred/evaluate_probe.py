@@ -25,7 +25,7 @@ from pred.data.batch import PointRange, build_source
 from pred.data.frame import Frame, FrameError, FrameSource, inside_range, outside_ego_box
 from pred.data.lidarseg import MERGED_NAMES, NUM_MERGED, merged_classes
 from pred.data.rays import draw_class_balanced
-from pred.evaluate import Confusion, load_frames, percent
+from pred.evaluate import Confusion, SpreadFrames, load_frames, percent
 from pred.models.pretrainer import Pretrainer
 from pred.pretrain import (
     RECALIBRATION_BATCHES,
@@ -131,13 +131,13 @@ def evaluate_probe(
     def frames(split: str, label: str) -> Iterator[Frame]:
         source = sources[split]
         with Progress(label, len(source)) as progress:
-            for frame in load_frames(source, len(source), config.data.on_error == "skip", skipped):
+            for frame in load_frames(source, config.data.on_error == "skip", skipped):
                 yield frame
                 progress.advance()
 
-    some = _Spread(sources[train_split], RECALIBRATION_BATCHES)
+    some = SpreadFrames(sources[train_split], RECALIBRATION_BATCHES)
     for network in networks.values():
-        usable = load_frames(some, len(some), config.data.on_error == "skip", skipped)
+        usable = load_frames(some, config.data.on_error == "skip", skipped)
         recalibrate_batch_norm(network, (whole_scan(frame, config, device) for frame in usable))
     features: dict[str, list[Tensor]] = {name: [] for name in networks}
     classes: list[NDArray[np.int64]] = []
@@ -200,22 +200,11 @@ def evaluate_probe(
     return result
 
 
-class _Spread:
-    """At most so many frames of a source, evenly spread, all with point classes."""
-
-    def __init__(self, source: FrameSource, num_frames: int | None) -> None:
-        self._source = source
-        chosen = min(len(source), num_frames or len(source))
-        self._rows = [position * len(source) // chosen for position in range(chosen)]
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def token(self, index: int) -> str:
-        return self._source.token(self._rows[index])
+class _ClassedFrames(SpreadFrames):
+    """Frames that must have classes of their points."""
 
     def load(self, index: int) -> Frame:
-        frame = self._source.load(self._rows[index])
+        frame = super().load(index)
         if frame.semantics is None:
             raise FrameError(frame.source, "frame must have classes of its points (lidarseg.json), got none")
         return frame
@@ -224,7 +213,7 @@ class _Spread:
 def _split_source(config: PretrainConfig, split: str, max_frames: int | None) -> FrameSource:
     """Frames of a split with point classes and without labels of images."""
     data = replace(config.data, split=split, labels="none", image_depth=None, depth_filter=None)
-    return _Spread(build_source(data, point_classes=True), max_frames)
+    return _ClassedFrames(build_source(data, point_classes=True), max_frames)
 
 
 def whole_scan(frame: Frame, config: PretrainConfig, device: torch.device) -> tuple[Tensor, Tensor]:
