@@ -206,21 +206,37 @@ def test_killed_at_random_steps_and_resumed_equals_uninterrupted(tmp_path: Path)
     assert len(json.loads((broken / "run.json").read_text())["resumed"]) == 2, killed_at
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc; elsewhere loader processes may stay")
-def test_a_killed_run_takes_its_loader_processes_along(tmp_path: Path) -> None:
-    config = tiny_config(tmp_path / "run", steps=100_000)
+def start_long_run(tmp_path: Path) -> subprocess.Popen[str]:
+    """A run with two loader processes, in a process group of its own, that has made its first steps."""
+    config = tiny_config(tmp_path / "run", steps=100_000, checkpoint_every=100_000)
     config.data.workers = 2
     config_file = write_config(tmp_path / "config.yaml", config)
-    run = subprocess.Popen([sys.executable, "-m", "pred", "pretrain", "--config", str(config_file)])
-    log, deadline = tmp_path / "run" / "log.csv", time.monotonic() + 120
-    while not (log.is_file() and len(log.read_text().splitlines()) > 3):
+    run = subprocess.Popen(command("--config", config_file), stdout=subprocess.PIPE, text=True, start_new_session=True)
+    deadline = time.monotonic() + 120
+    while steps_logged(tmp_path / "run") < 3:
         assert run.poll() is None and time.monotonic() < deadline
         time.sleep(0.05)
+    return run
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a signal to its loader processes ends a run")
+def test_a_signal_to_all_processes_of_a_run_writes_a_checkpoint(tmp_path: Path) -> None:
+    """As job schedulers send it."""
+    run = start_long_run(tmp_path)
+    os.killpg(run.pid, signal.SIGTERM)
+    output = run.communicate(timeout=60)[0]
+    assert run.returncode == 128 + signal.SIGTERM and "stopped by SIGTERM after step" in output
+    assert len(list_checkpoints(tmp_path / "run" / "checkpoints")) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc; elsewhere loader processes may stay")
+def test_a_killed_run_takes_its_loader_processes_along(tmp_path: Path) -> None:
+    run = start_long_run(tmp_path)
     workers = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
     assert len(workers) == 2
     time.sleep(0.5)  # their queues fill up
     run.kill()
-    run.wait()
+    run.communicate()
     deadline = time.monotonic() + 10
     while any(_runs(pid) for pid in workers):
         assert time.monotonic() < deadline

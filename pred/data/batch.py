@@ -367,6 +367,8 @@ class _ErrorsAsItems(Dataset[Any]):
 def _end_with_parent(worker: int) -> None:
     if sys.platform == "linux":  # elsewhere a worker may outlive a killed parent, waiting to hand over a batch
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        # A job scheduler's goes to all processes of a run, which is to finish its step and write a checkpoint.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
 def make_loader(dataset: TrainingBatches, start_step: int = 0, workers: int = 0) -> DataLoader[Batch]:
