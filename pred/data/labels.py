@@ -8,6 +8,7 @@ pixels are scaled to it. It must show the whole image, so its aspect ratio must 
 
 from __future__ import annotations
 
+import math
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -299,9 +300,15 @@ def _header(archive: zipfile.ZipFile, key: str) -> tuple[tuple[int, ...], np.dty
 
 
 def _array(archive: zipfile.ZipFile, key: str) -> NDArray[Any]:
-    with archive.open(f"{key}.npy") as stream:
+    name = f"{key}.npy"
+    with archive.open(name) as stream:
+        shape, dtype = _npy_header(stream)
+        num_bytes = stream.tell() + math.prod(shape) * dtype.itemsize
+    if archive.getinfo(name).file_size != num_bytes:
+        raise ValueError(f"{archive.getinfo(name).file_size} bytes of {name} instead of {num_bytes}")
+    with archive.open(name) as stream:
         array: NDArray[Any] = npy_format.read_array(stream, allow_pickle=False)
-        stream.read()  # to the end, where the checksum is compared
+        stream.read()  # the end, where the checksum is compared
         return array
 
 

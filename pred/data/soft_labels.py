@@ -66,8 +66,14 @@ def encode(probabilities: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     if not good.all():
         raise ValueError(f"probabilities must be in [0, 1] with a sum of 1, got {values[np.argmin(good)].tolist()}")
     # At most half of a probability of 1 is left for the second largest, so its code is 202 at most.
-    codes = np.rint(np.cbrt(values) * LARGEST).astype(np.uint8)
-    codes[np.arange(len(values)), values.argmax(axis=1)] = LARGEST
+    roots, row, largest = np.cbrt(values) * LARGEST, np.arange(len(values)), values.argmax(axis=1)
+    codes = np.rint(roots).astype(np.uint8)
+    codes[row, largest] = LARGEST
+    # Where classes are nearly equal, what rounding leaves may be less than the second largest. Rounded down, it is more.
+    others = DECODED[codes]
+    overtaken = 1.0 - others.sum(axis=1) <= others.max(axis=1, initial=0.0)
+    codes[overtaken] = np.floor(roots[overtaken]).astype(np.uint8)
+    codes[row, largest] = LARGEST
     return np.ascontiguousarray(codes.T)
 
 

@@ -55,6 +55,16 @@ def test_codes_by_hand() -> None:
     assert decoded[2] == pytest.approx(1 - sum(expected), rel=1e-6)
 
 
+@pytest.mark.parametrize("scale", [0.0, 0.01, 0.3, 1.0, 5.0])
+def test_the_most_probable_class_stays(scale: float) -> None:
+    """Also where classes are so close that rounding could change their order; ties take the first class."""
+    probabilities = softmax(np.random.default_rng(0), 20_000, scale)
+    decoded = soft_labels.decode(soft_labels.encode(probabilities))
+    assert np.array_equal(decoded.argmax(axis=1), probabilities.argmax(axis=1))
+    # Rounded down, each of 18 others loses up to a step of its code, which is 3 x 96^2 / 255^3 near 1 / 19.
+    assert np.abs(decoded - probabilities).max() < 18 * 3 * 96**2 / 255**3 and (decoded >= 0).all()
+
+
 def test_lookup_and_class_map(tmp_path: Path) -> None:
     label = write(tmp_path / "label.npz")
     # The image is 32 x 18, so a cell has 2 x 2 pixels: cells 0, 5, none, 16, 143.
@@ -175,6 +185,18 @@ def test_truncated_and_flipped_files(tmp_path: Path) -> None:
             assert np.array_equal(label.lookup(uv).target, right)
         except FrameError as error:
             assert str(path) in str(error)
+
+
+def test_surplus_bytes_are_not_read(tmp_path: Path) -> None:
+    """A small file may hold gigabytes of zeros behind an array."""
+    path = tmp_path / "label.npz"
+    member = io.BytesIO()
+    np.lib.format.write_array(member, np.full((19, 9, 16), 0.05, dtype=np.float32))
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("probabilities.npy", member.getvalue() + bytes(1000))
+    size = len(member.getvalue())
+    with pytest.raises(FrameError, match=rf"label\.npz: .*{size + 1000} bytes of probabilities.npy instead of {size}"):
+        PseudoLabel(path, 32, 18).lookup(np.zeros((1, 2)))
 
 
 def test_claimed_sizes_are_not_trusted(tmp_path: Path) -> None:
