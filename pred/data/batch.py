@@ -10,6 +10,8 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from multiprocessing.process import BaseProcess
+from multiprocessing.util import Finalize
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -347,10 +349,18 @@ class _Loader(DataLoader[T]):
         )
 
     def __iter__(self) -> Iterator[T]:  # type: ignore[override]
-        for item in super().__iter__():
-            if isinstance(item, FrameError):
-                raise item
-            yield item
+        items = super().__iter__()
+        workers = getattr(items, "_workers", [])
+        # When this process ends, multiprocessing sends its children SIGTERM, which these ignore, and waits for them.
+        at_exit = Finalize(None, _kill, args=(workers,), exitpriority=0)
+        try:
+            for item in items:
+                if isinstance(item, FrameError):
+                    raise item
+                yield item
+        finally:
+            del items  # an error's traceback would keep it, and its processes with it
+            at_exit.cancel()
 
 
 class _ErrorsAsItems(Dataset[Any]):
@@ -362,6 +372,11 @@ class _ErrorsAsItems(Dataset[Any]):
             return self._dataset[index]
         except FrameError as error:
             return error
+
+
+def _kill(workers: Sequence[BaseProcess]) -> None:
+    for worker in workers:
+        worker.kill()
 
 
 def _end_with_parent(worker: int) -> None:

@@ -69,7 +69,7 @@ def encode(probabilities: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     roots, row, largest = np.cbrt(values) * LARGEST, np.arange(len(values)), values.argmax(axis=1)
     codes = np.rint(roots).astype(np.uint8)
     codes[row, largest] = LARGEST
-    # Where classes are nearly equal, what rounding leaves may be less than the second largest. Rounding down leaves more.
+    # Where classes are nearly equal, rounding may leave less than the second largest has; rounding down leaves more.
     others = DECODED[codes]
     overtaken = 1.0 - others.sum(axis=1) <= others.max(axis=1, initial=0.0)
     codes[overtaken] = np.floor(roots[overtaken]).astype(np.uint8)

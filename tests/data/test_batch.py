@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -421,6 +423,18 @@ def test_steps_outside_the_run() -> None:
 
 
 # Broken frames
+
+
+def test_a_program_that_still_holds_batches_ends() -> None:
+    """Its loader processes ignore the SIGTERM that multiprocessing sends them before it waits for them."""
+    program = (
+        "import torch.utils.data, pred.data.batch as b\n"
+        "held = iter(b._Loader(torch.utils.data.TensorDataset(torch.zeros(99)), range(99), workers=1))\n"
+        "next(held)\n"
+        "raise SystemExit(7)\n"
+    )
+    finished = subprocess.run([sys.executable, "-c", program], timeout=60, check=False)
+    assert finished.returncode == 7
 
 
 def test_broken_frame_stops_the_loader_with_its_text(tree: Tree) -> None:
