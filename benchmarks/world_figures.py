@@ -3,7 +3,7 @@
 """How incomplete and how occluded a made world is: `python -m benchmarks.world_figures ROOT`.
 
 ROOT: a world in the nuScenes layout, made with ``--exact-labels``. Boxes are those of its table sample_annotation; a
-LiDAR point is behind what its pixel shows if the exact depth there is less by more than 0.5 m and 2 %.
+return outside the own car is behind what its pixel shows by the rule of `pred evaluate rendering`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.measure import machine_record
 from pred.data.nuscenes import NuScenesFrames
+from pred.evaluate import shows_nearer_surface
+from pred.run_folder import write_json
 
 
 class Figures(NamedTuple):
@@ -45,10 +48,8 @@ def world_figures(root: Path) -> Figures:
         for camera in frame.cameras:
             uv, z_depth_m = camera.project(points)
             inside = camera.in_image(uv, z_depth_m)
-            shown_m, z_depth_m = camera.depth_at(uv[inside]), z_depth_m[inside]
-            projected += len(z_depth_m)
-            # Without depth a pixel shows the sky: nothing is in front.
-            hidden += int((z_depth_m - shown_m > 0.5 + 0.02 * z_depth_m).sum())
+            projected += int(inside.sum())
+            hidden += int(shows_nearer_surface(z_depth_m[inside], camera.depth_at(uv[inside])).sum())
     (table,) = root.glob("v1.0-*/sample_annotation.json")
     num_points = np.array([row["num_lidar_pts"] for row in json.loads(table.read_text())])
     return Figures(len(frames), len(num_points), int((num_points < 5).sum()), projected, hidden)
@@ -57,4 +58,10 @@ def world_figures(root: Path) -> Figures:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser("python -m benchmarks.world_figures", description=__doc__)
     parser.add_argument("root", type=Path, metavar="ROOT")
-    print(world_figures(parser.parse_args().root).report())
+    parser.add_argument("--json", type=Path, help="file to write the counts to")
+    options = parser.parse_args()
+    figures = world_figures(options.root)
+    print(figures.report())
+    if options.json is not None:
+        made_with = json.loads((options.root / "world.json").read_text())
+        write_json(options.json, {**figures._asdict(), "world": made_with, "machine": machine_record()})

@@ -10,17 +10,18 @@ same network, rays, steps and data; they differ in the options below. What is fi
 
 from __future__ import annotations
 
+import csv
 import json
 import statistics
 import subprocess
 import sys
-import time
 from argparse import ArgumentParser
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.measure import machine_record
+from pred.run_folder import claim_settings, write_json
 
 EVALUATED_FRAMES = 16
 """Four of each unseen scene, for the rendering: each has some 60,000 rays."""
@@ -67,15 +68,13 @@ UNTRAINED: dict[str, tuple[str, Figure]] = {
 
 
 def run_variant(root: Path, run: Path, variant: str, seed: int, options: Sequence[str]) -> dict[str, Any]:
-    """Pre-train and measure one run, or what is left of it; returns its two evaluations and its duration."""
-    start_time = time.monotonic()
+    """Pre-train and measure one run, or what is left of it; returns its two evaluations and the time of its steps."""
     if not (run / "encoder.pth").is_file():
         if (run / "config.yaml").is_file():
             _pred("pretrain", "--resume", str(run))
         else:
-            new = [f"--data.root={root}", f"--train.seed={seed}", f"--run={run}"]
+            new = [f"--data.root={root}", "--data.labels=pseudo/exact", f"--train.seed={seed}", f"--run={run}"]
             _pred("pretrain", "--config=world_pillars", *options, *VARIANTS[variant], *new)
-        (run / "training_s.txt").write_text(f"{time.monotonic() - start_time:.0f}\n")
     rendering, probe = run / "evaluation_rendering.json", run / "evaluation_probe.json"
     if not rendering.is_file():
         measured = ["--data.split=val", DEPTH_MAPS, "--all-returns", f"--frames={EVALUATED_FRAMES}"]
@@ -83,10 +82,17 @@ def run_variant(root: Path, run: Path, variant: str, seed: int, options: Sequenc
     if not probe.is_file():
         _pred("evaluate", "probe", str(run))
     return {
-        "training_s": float((run / "training_s.txt").read_text()),
+        "training_s": training_s(run),
         "rendering": json.loads(rendering.read_text()),
         "probe": json.loads(probe.read_text()),
     }
+
+
+def training_s(run: Path) -> float:
+    """Steps times the mean duration of those that were logged, seconds: a run that was resumed has no single clock."""
+    with open(run / "timing.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return int(rows[-1]["step"]) * statistics.mean(float(row["duration_s"]) for row in rows)
 
 
 def summarise(
@@ -130,13 +136,21 @@ def _pred(*arguments: str) -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs what is missing, prints the tables and writes ``<out>/world_study.json``."""
-    parser = ArgumentParser("python -m benchmarks.world_study", description=(__doc__ or "").partition("\n")[0])
+    parser = ArgumentParser(
+        "python -m benchmarks.world_study", description=(__doc__ or "").partition("\n")[0], allow_abbrev=False
+    )
     parser.add_argument("root", type=Path, help="world made with --exact-labels")
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
     options, pretrain_options = parser.parse_known_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
+    wanted = {
+        "root": str(options.root.resolve()),
+        "pretrain_options": pretrain_options,
+        "variants": VARIANTS,
+        "evaluated_frames": EVALUATED_FRAMES,
+    }
+    claim_settings(options.out / "settings.json", wanted)
     runs: dict[str, list[dict[str, Any]]] = {variant: [] for variant in options.variants}
     for seed in options.seeds:
         for variant in options.variants:
@@ -152,7 +166,7 @@ def main(arguments: Sequence[str]) -> int:
         "tables": tables,
         "runs": runs,
     }
-    (options.out / "world_study.json").write_text(json.dumps(record, indent=1))
+    write_json(options.out / "world_study.json", record)
     print("\n\n".join(markdown(table) for table in tables.values()))
     return 0
 

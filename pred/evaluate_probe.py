@@ -154,9 +154,10 @@ def evaluate_probe(
                 )
                 classes.append(cells.merged)
             features[name].append(features_at(bev, cells))
+    if not any(map(len, classes)):
+        because = next((f"; {reason}" for reason in skipped.values()), "")
+        raise ValueError(f"evaluate probe: split {train_split} must have cells of known class, got none{because}")
     merged = torch.from_numpy(np.concatenate(classes)).to(device)
-    if len(merged) == 0:
-        raise ValueError(f"evaluate probe: split {train_split} must have cells of known class, got none")
     probes = {name: fit_probe(torch.cat(parts), merged) for name, parts in features.items()}
     features.clear()
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from benchmarks import world_study
+from pred.run_folder import RunFolderError
 
 
 def fake_rendering(accuracy: float) -> dict[str, Any]:
@@ -33,6 +34,7 @@ def test_runs_and_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
             run = Path(arguments[-1].removeprefix("--run="))  # or after --resume
             run.mkdir(exist_ok=True)
             (run / "config.yaml").touch()
+            (run / "timing.csv").write_text("step,duration_s,rays_per_s\n1,0.5,9\n10,0.1,9\n")
             (run / "encoder.pth").touch()
         else:
             run = Path(arguments[2])
@@ -50,6 +52,7 @@ def test_runs_and_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
     assert "--train.seed=1" in commands[6]
 
     record = json.loads((tmp_path / "world_study.json").read_text())
+    assert record["runs"]["rendering"][0]["training_s"] == pytest.approx(10 * 0.3)
     row = record["tables"]["trained"]["class of occluded returns"]
     assert row["projection"]["values"] == [0.5, 0.6]
     assert row["projection"]["mean"] == pytest.approx(0.55)
@@ -62,5 +65,7 @@ def test_runs_and_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 
     commands.clear()
     (tmp_path / "rendering-seed0" / "encoder.pth").unlink()  # as after a kill
-    assert world_study.main(arguments) == 0
+    assert world_study.main([*arguments, "--train.steps=7"]) == 0
     assert commands == [["pretrain", "--resume", str(tmp_path / "rendering-seed0")]]
+    with pytest.raises(RunFolderError, match="pretrain_options must be"):
+        world_study.main([*arguments, "--train.steps=8"])
