@@ -9,6 +9,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import random
 import re
 import shutil
 import signal
@@ -85,6 +86,20 @@ def tree(root: Path) -> dict[str, str]:
     """Digest of every file, hidden ones included."""
     files = sorted(path for path in root.rglob("*") if path.is_file())
     return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def kill_at_random(command: list[str], begun: Path, times: int, seed: int) -> None:
+    """Start a command so many times and SIGKILL its processes, up to 1.5 s after the folder ``begun`` is there."""
+    rng = random.Random(seed)
+    for _ in range(times):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+        deadline = time.monotonic() + 60
+        while not begun.is_dir() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0, 1.5))
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 # Files

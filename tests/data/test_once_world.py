@@ -5,12 +5,7 @@
 from __future__ import annotations
 
 import json
-import os
-import random
-import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +25,7 @@ from pred.data.world.nuscenes_writer import WorldSettings
 from pred.data.world.once_layout import ONCE_MOUNTS, once_splits
 from pred.data.world.sensors import T_EGO_FROM_LIDAR, mounted_camera
 from pred.world import make_world
-from tests.data.test_nuscenes_writer import tree
+from tests.data.test_nuscenes_writer import kill_at_random, tree
 
 SEED, KEYFRAMES, WIDTH, HEIGHT = 3, 2, 96, 51
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -193,17 +188,8 @@ def test_every_fifth_frame_is_not_annotated(tmp_path: Path) -> None:
 def test_killed_and_continued_with_two_workers(root: Path, tmp_path: Path) -> None:
     """SIGKILL at random moments; the files are those of one process that ran to its end."""
     out = tmp_path / "world"
-    rng = random.Random(5)
-    for _ in range(3):
-        program = [sys.executable, "-m", "pred", "world", "make", str(out), *COMMAND, "--exact-labels"]
-        process = subprocess.Popen([*program, "--workers", "2"], stdout=subprocess.DEVNULL, start_new_session=True)
-        deadline = time.monotonic() + 60
-        while not (out / "data").is_dir() and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.01)
-        time.sleep(rng.uniform(0, 1.5))
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+    command = [sys.executable, "-m", "pred", "world", "make", str(out), *COMMAND, "--exact-labels", "--workers", "2"]
+    kill_at_random(command, begun=out / "data", times=3, seed=5)
     settings = WorldSettings(2, SEED, KEYFRAMES, 0.05, layout="once", exact_labels=True)
     make_world(out, settings, workers=2)
     assert made_files(out) == made_files(root)

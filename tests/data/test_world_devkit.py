@@ -4,12 +4,8 @@
 
 from __future__ import annotations
 
-import os
-import random
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +13,7 @@ import numpy as np
 import pytest
 
 from pred import cli
-from tests.data.test_nuscenes_writer import evaluate, table, tree
+from tests.data.test_nuscenes_writer import evaluate, kill_at_random, table, tree
 
 COMMAND = ["--scenes", "2", "--seed", "11", "--keyframes", "2", "--image-scale", "0.05", "--exact-labels"]
 
@@ -116,15 +112,6 @@ def test_killed_and_continued_with_two_workers(root: Path, tmp_path: Path, seed:
     """SIGKILL at random moments; the files are those of one process that ran to its end."""
     out = tmp_path / "world"
     command = [sys.executable, "-m", "pred", "world", "make", str(out), *COMMAND, "--workers", "2"]
-    rng = random.Random(seed)
-    for _ in range(2):
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
-        deadline = time.monotonic() + 60
-        while not (out / "sweeps").is_dir() and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.01)
-        time.sleep(rng.uniform(0, 1.5))
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+    kill_at_random(command, begun=out / "sweeps", times=2, seed=seed)
     assert subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode == 0
     assert tree(out) == tree(root)
