@@ -21,11 +21,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import yaml
 from numpy.typing import NDArray
 from rich.table import Table
 from torch import Tensor
 
-from pred.data.batch import Batch, build_source, evaluation_batch, evaluation_rows
+from pred.data.batch import Batch, DataConfig, build_source, evaluation_batch, evaluation_rows
 from pred.data.frame import CLASS_NAMES, NUM_CLASSES, Frame, FrameError, FrameSource
 from pred.data.lidarseg import MERGED_NAMES, NO_CLASS, NUM_MERGED, merged_classes
 from pred.data.rays import DepthTolerance, depths_agree
@@ -157,6 +158,12 @@ def evaluate_rendering(
         raise ValueError(f"evaluate: frames must be at least 1, got {max_frames}")
     folder = RunFolder(run)
     folder.require()
+    seen = trained_on(folder, config.data)
+    if all_returns and seen:
+        raise ValueError(
+            "evaluate: all_returns must go with frames that the run was not trained on, got the run's own; "
+            "name others, such as --data.split val"
+        )
     source = SpreadFrames(build_source(config.data, point_classes=True), max_frames)
     device = pick_device(config.train)
     trained, checkpoint = load_model(config, folder, checkpoint)
@@ -188,6 +195,7 @@ def evaluate_rendering(
         "checkpoint": str(checkpoint),
         "root": config.data.root,
         "split": config.data.split,
+        "trained_on": seen,
         "frames": len(source) - len(skipped),
         "skipped": skipped,
         "all_returns": all_returns,
@@ -212,6 +220,14 @@ def evaluate_rendering(
         progress.console.print(returns_table(result))
     progress.message(f"written: {folder.path / 'evaluation_rendering.json'}")
     return result
+
+
+def trained_on(folder: RunFolder, data: DataConfig) -> bool:
+    """Whether a run's own configuration names the frames of ``data``, or all of that data set."""
+    own = yaml.safe_load(folder.config.read_text())["data"]
+    same_set = all(own.get(key) == getattr(data, key) for key in ("dataset", "root", "version"))
+    every = own.get("split") is None and own.get("info") is None
+    return same_set and (every or (own.get("split"), own.get("info")) == (data.split, data.info))
 
 
 class SpreadFrames:
@@ -264,7 +280,7 @@ def returns_of(frame: Frame, rows: NDArray[np.int64]) -> Returns | None:
         class_id[new] = np.where(labels < 0, NO_CLASS, labels)
         if camera.depth is not None:
             occluded[new] = shows_nearer_surface(z_depth_m[new], camera.depth_at(uv[new]))
-    has_depth = any(camera.depth is not None for camera in cameras)
+    has_depth = len(cameras) > 0 and all(camera.depth is not None for camera in cameras)
     return Returns(
         merged=merged_classes(frame.semantics[rows]),
         in_image=in_image,

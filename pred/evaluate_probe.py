@@ -25,7 +25,7 @@ from pred.data.batch import PointRange, build_source
 from pred.data.frame import Frame, FrameError, FrameSource, inside_range, outside_ego_box
 from pred.data.lidarseg import MERGED_NAMES, NUM_MERGED, merged_classes
 from pred.data.rays import draw_class_balanced
-from pred.evaluate import Confusion, SpreadFrames, load_frames, percent
+from pred.evaluate import Confusion, SpreadFrames, load_frames, percent, trained_on
 from pred.models.pretrainer import Pretrainer
 from pred.pretrain import (
     RECALIBRATION_BATCHES,
@@ -120,6 +120,8 @@ def evaluate_probe(
     if config.data.dataset != "nuscenes" or config.data.info is not None:
         got = f"{config.data.dataset} with data.info {config.data.info}"
         raise ValueError(f"evaluate probe: data.dataset must be nuscenes, with splits, got {got}")
+    if train_split == val_split:
+        raise ValueError(f"evaluate probe: val-split must be another than train-split, got {val_split} twice")
     folder = RunFolder(run)
     folder.require()
     sources = {split: _split_source(config, split, max_frames) for split in (train_split, val_split)}
@@ -178,6 +180,7 @@ def evaluate_probe(
         "root": config.data.root,
         "train_split": train_split,
         "val_split": val_split,
+        "encoder_trained_on_val": trained_on(folder, replace(config.data, split=val_split)),
         "cells_per_frame": cells_per_frame,
         "train_frames": len(classes),
         "val_frames": num_val_frames,

@@ -29,10 +29,10 @@ from pred import __version__
 from pred.checkpoint import atomic_write, remove_leftovers
 from pred.data import soft_labels
 from pred.data.batch import DataConfig, build_source
-from pred.data.frame import CLASS_NAMES, NUM_CLASSES, Camera, Frame, FrameError
+from pred.data.frame import CLASS_NAMES, NUM_CLASSES, Camera, Frame, FrameError, FrameSource
 from pred.data.labels import LabelLookup, PseudoLabel, label_cells
 from pred.progress import Progress
-from pred.run_folder import claim_settings
+from pred.run_folder import claim_settings, one_writer
 from pred.segmenter import Segmenter, load_segmenter, probabilities_at
 
 PREVIEW_WIDTH = 480
@@ -135,21 +135,27 @@ def label(config: LabelConfig) -> Statistics:
 
     Raises:
         FrameError: a file of the data set or the checkpoint cannot be used.
-        RunFolderError: the folder holds labels that were made otherwise.
+        RunFolderError: the folder holds labels that were made otherwise, or another process writes to it.
         RuntimeError: transformers is not installed.
     """
     segmenter = load_segmenter(config.model, config.size)
     # All returns of the keyframe, whatever the later training leaves out.
     source = build_source(replace(config.data, labels="none", sweeps=1, ego_box=(0.0, 0.0, 0.0, 0.0)))
     folder = config.folder
-    folder.parent.mkdir(exist_ok=True)
-    claim_settings(folder / "settings.json", _settings(config, segmenter))
+    with one_writer(folder):
+        claim_settings(folder / "settings.json", _settings(config, segmenter))
+        return _label(config, segmenter, source)
+
+
+def _label(config: LabelConfig, segmenter: Segmenter, source: FrameSource) -> Statistics:
+    folder = config.folder
     segmenter.model.to("cuda" if torch.cuda.is_available() else "cpu")
     shown = set(np.linspace(0, len(source) - 1, min(config.previews, len(source))).round().astype(int).tolist())
 
     def read(index: int) -> tuple[Frame, list[Task], Path | None]:
         frame = source.load(index)
-        preview = folder / PREVIEWS / f"{index:06d}.png" if index in shown else None
+        name = re.sub(r"[^\w.-]+", "-", frame.token)
+        preview = folder / PREVIEWS / f"{name}.png" if index in shown else None
         return frame, list(_tasks(frame, config)), None if preview is None or preview.is_file() else preview
 
     statistics = Statistics()
@@ -168,6 +174,7 @@ def label(config: LabelConfig) -> Statistics:
                 found.append(labels)
             if preview is not None:
                 preview.parent.mkdir(exist_ok=True)
+                remove_leftovers(preview)
                 picture = _preview(frame.token, tasks, logits, found)
                 with atomic_write(preview) as file:
                     picture.save(file, format="PNG")

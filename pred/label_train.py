@@ -1,6 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""`pred label train`: a DeepLabV3-style MobileNetV2 from images and class maps. The loop is `train_segmenter`.
+"""`pred label train`: a DeepLabV3-style MobileNetV2 from images and class maps. The loop is `_train`.
 
 OUT/settings.json       the settings; an OUT with others is refused
 OUT/checkpoints/        for a run that continues; gone once the network is there
@@ -28,13 +28,13 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from pred.checkpoint import load_latest, save_checkpoint
+from pred.checkpoint import atomic_write, load_latest, save_checkpoint
 from pred.config import plain
 from pred.data.batch import DataConfig, build_source
 from pred.data.frame import CLASS_NAMES, NUM_CLASSES, Camera, FrameError, FrameSource
 from pred.progress import Progress, format_duration
 from pred.random import numpy_generator, seed_of
-from pred.run_folder import claim_settings, write_json
+from pred.run_folder import claim_settings, one_writer, write_json
 from pred.segmenter import Segmenter, load_segmenter, require_transformers
 
 IGNORED = 255
@@ -124,18 +124,26 @@ def train_segmenter(config: LabelTrainConfig) -> Path:
 
     Raises:
         FrameError: data or a checkpoint cannot be used.
-        ValueError: the folder holds other settings; a loss is not finite.
+        RunFolderError: the folder holds other settings, or another process writes to it.
+        ValueError: a loss is not finite.
         RuntimeError: transformers is not installed.
     """
     require_transformers()
     out = Path(config.out)
     train_frames = LabelledImages(config, config.train_split)
     val_frames = LabelledImages(config, config.val_split)
-    claim_settings(out / "settings.json", plain(config))
-    if (out / WEIGHTS_FILE).is_file() and (out / "evaluation.json").is_file():
-        print(f"{out}: the network is complete; nothing to do")
-        return out
+    with one_writer(out):
+        claim_settings(out / "settings.json", plain(config))
+        if (out / WEIGHTS_FILE).is_file() and (out / "evaluation.json").is_file():
+            shutil.rmtree(out / "checkpoints", ignore_errors=True)
+            print(f"{out}: the network is complete; nothing to do")
+        else:
+            _train(config, out, train_frames, val_frames)
+    return out
 
+
+def _train(config: LabelTrainConfig, out: Path, train_frames: "LabelledImages", val_frames: "LabelledImages") -> None:
+    """The loop."""
     segmenter = build_segmenter(config, train_frames.image_size)
     model = segmenter.model
     # Its output is not used for segmentation, and it costs time.
@@ -173,6 +181,8 @@ def train_segmenter(config: LabelTrainConfig) -> Path:
             logits = model(pixel_values=batch.pixel_values.contiguous(memory_format=torch.channels_last)).logits
             logits = F.interpolate(logits, size=batch.classes.shape[-2:], mode="bilinear", align_corners=False)
             loss = F.cross_entropy(logits, batch.classes, weights, ignore_index=IGNORED)
+            if bool((batch.classes == IGNORED).all()):  # the mean over nothing
+                loss = 0 * logits.sum()
             if not math.isfinite(loss.item()):
                 raise ValueError(f"label train: loss must be finite, got {loss.item()} in step {step}; lower lr")
             optimizer.zero_grad()
@@ -191,8 +201,7 @@ def train_segmenter(config: LabelTrainConfig) -> Path:
     model.mobilenet_v2.conv_1x1 = spare
     model.eval().requires_grad_(False)
 
-    model.save_pretrained(out)
-    segmenter.processor.save_pretrained(out)
+    export(segmenter, out)
     measured = evaluate(load_segmenter(str(out)), val_frames)
     facts = {"steps": step, "training_s": round(elapsed_s, 1), "threads": torch.get_num_threads()}
     write_json(out / "evaluation.json", {**measured, **facts})
@@ -200,7 +209,18 @@ def train_segmenter(config: LabelTrainConfig) -> Path:
     print_table(
         measured, f"{config.val_split}: {measured['images']} images, {step} steps in {format_duration(elapsed_s)}"
     )
-    return out
+
+
+def export(segmenter: Segmenter, out: Path) -> None:
+    """Files for `from_pretrained`. Each appears as a whole, the weights last."""
+    staging = out / ".export"
+    shutil.rmtree(staging, ignore_errors=True)
+    segmenter.model.save_pretrained(staging)
+    segmenter.processor.save_pretrained(staging)
+    for path in sorted(staging.iterdir(), key=lambda path: path.name == WEIGHTS_FILE):
+        with atomic_write(out / path.name) as file:
+            file.write(path.read_bytes())
+    shutil.rmtree(staging)
 
 
 def build_segmenter(config: LabelTrainConfig, image_size: tuple[int, int]) -> Segmenter:

@@ -15,6 +15,7 @@ RUN/pictures/, RUN/*.json       made by `pred view` and `pred evaluate`
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import json
 import os
@@ -22,7 +23,8 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -37,7 +39,7 @@ from pred.checkpoint import TEMPORARY_SUFFIX, write_text
 
 
 class RunFolderError(RuntimeError):
-    """A run folder is missing, incomplete, or already in use."""
+    """A folder that a job writes to is missing, incomplete, in use, or another's."""
 
 
 @dataclass
@@ -111,6 +113,27 @@ class RunFolder:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Replace ``path`` with ``content`` as indented JSON, atomically."""
     write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+@contextmanager
+def one_writer(folder: Path) -> Iterator[None]:
+    """Make a folder if need be and hold it for this process. The lock leaves no file and ends with the process.
+
+    Raises:
+        RunFolderError: it is a file, or another process holds it.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise RunFolderError(f"{folder}: must be a folder, got a file")
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunFolderError(f"{folder}: must have one writer, got another process") from None
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def claim_settings(path: Path, wanted: Mapping[str, Any]) -> None:

@@ -15,7 +15,6 @@ of workers.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import multiprocessing
 import os
@@ -38,14 +37,11 @@ from pred.data import index
 from pred.data.world.nuscenes_writer import Part, WorldSettings, write_dataset, write_keyframe
 from pred.data.world.once_layout import once_splits, sequence_name, write_sequence, write_splits
 from pred.progress import Progress, format_duration
+from pred.run_folder import RunFolderError, one_writer
 
 Job = tuple[int, ...]
 MakeDrive = Callable[[int, int, int], Any]
 """(seed, scene, keyframes) to a `pred.data.world.drive.Drive`."""
-
-
-class WorldFolderError(ValueError):
-    """An output folder holds something else. The text names what."""
 
 
 def make_world(
@@ -60,7 +56,7 @@ def make_world(
         make_drive: replaces the procedural drives. It must be importable by name where workers is not 1.
 
     Raises:
-        WorldFolderError: ``out`` holds other settings or foreign files, or another process writes to it.
+        RunFolderError: ``out`` holds other settings or foreign files, or another process writes to it.
         ValueError: ``workers`` is less than 1.
     """
     if make_drive is None:
@@ -71,7 +67,7 @@ def make_world(
     if workers < 1:
         raise ValueError(f"world: workers must be at least 1, got {workers}")
     work = _LAYOUTS[settings.layout](out, settings, make_drive)
-    with _lock(out):
+    with one_writer(out):
         _claim(out, settings, work)
         if work.is_complete():
             shutil.rmtree(out / ".parts", ignore_errors=True)
@@ -192,23 +188,6 @@ def _part_file(parts: Path, scene: int, number: int) -> Path:
 # The folder
 
 
-@contextmanager
-def _lock(out: Path) -> Iterator[None]:
-    """Make the folder if need be and hold it for this process. The lock leaves no file and ends with the process."""
-    if out.exists() and not out.is_dir():
-        raise WorldFolderError(f"{out}: must be a folder, got a file")
-    out.mkdir(parents=True, exist_ok=True)
-    folder = os.open(out, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise WorldFolderError(f"{out}: must have one writer, got another process") from None
-        yield
-    finally:
-        os.close(folder)
-
-
 def _libraries() -> dict[str, str]:
     """Versions of the packages on which the bytes of the files depend."""
     return {name: metadata.version(name) for name in ("embreex", "numpy", "pillow")}
@@ -222,13 +201,13 @@ def _claim(out: Path, settings: WorldSettings, work: _Work) -> None:
     if not record.is_file():
         foreign = [name for name in held if not name.startswith(f".{record.name}.")]
         if foreign:
-            raise WorldFolderError(f"{out}: must be new or empty, or hold an interrupted world, got {foreign[0]}")
+            raise RunFolderError(f"{out}: must be new or empty, or hold an interrupted world, got {foreign[0]}")
         write_text(record, json.dumps(wanted, indent=2) + "\n")
         return
     try:
         found = json.loads(record.read_text())
     except ValueError as error:
-        raise WorldFolderError(f"{record}: must be the settings of a world, got no valid JSON: {error}") from None
+        raise RunFolderError(f"{record}: must be the settings of a world, got no valid JSON: {error}") from None
     complete = work.is_complete()
     for name in wanted:
         if name == "libraries" and complete:  # no more files come
@@ -236,13 +215,13 @@ def _claim(out: Path, settings: WorldSettings, work: _Work) -> None:
         value = found.get(name) if isinstance(found, dict) else None
         if value != wanted[name]:
             source = "here" if name in ("libraries", "made_by") else "asked for"
-            raise WorldFolderError(f"{record}: {name} must be {wanted[name]!r} as {source}, got {value!r}")
+            raise RunFolderError(f"{record}: {name} must be {wanted[name]!r} as {source}, got {value!r}")
     if complete:  # other jobs may add to it
         return
     own = {record.name, ".parts", index.FILE_NAME, *work.folders}
     foreign = [name for name in held if name not in own and not name.endswith(TEMPORARY_SUFFIX)]
     if foreign:
-        raise WorldFolderError(f"{out}: must hold nothing but the interrupted world, got {foreign[0]}")
+        raise RunFolderError(f"{out}: must hold nothing but the interrupted world, got {foreign[0]}")
 
 
 # Processes

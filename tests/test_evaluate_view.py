@@ -278,7 +278,7 @@ def test_pixels_of_returns_by_hand(tmp_path: Path) -> None:
     assert without_depth is not None and set(without_depth.groups()) == {"all", "in_image"}
 
 
-def test_rendered_classes_are_compared_with_the_true_ones(config: PretrainConfig) -> None:
+def test_rendered_classes_are_compared_with_the_true_ones(config: PretrainConfig, tmp_path: Path) -> None:
     """A made world knows them, and its labels are exact: pixels are wrong by parallax only."""
     result = evaluate_rendering(config, run_of(config), max_frames=1)
     counts = result["returns_by_class"]
@@ -288,8 +288,14 @@ def test_rendered_classes_are_compared_with_the_true_ones(config: PretrainConfig
     for name in ("trained", "untrained"):
         assert set(result[name]["returns"]) == set(counts)
     assert result["trained"]["returns"]["all"]["accuracy"] > result["untrained"]["returns"]["all"]["accuracy"]
-    more = evaluate_rendering(config, run_of(config), max_frames=1, all_returns=True)
-    assert more["all_returns"] and more["depth_rays"] > 5 * result["depth_rays"]
+    assert result["trained_on"]
+    with pytest.raises(ValueError, match="all_returns must go with frames that the run was not trained on"):
+        evaluate_rendering(config, run_of(config), max_frames=1, all_returns=True)
+    elsewhere = tmp_path / "world"
+    elsewhere.symlink_to(str(config.data.root))
+    other = replace(config, data=replace(config.data, root=str(elsewhere)))
+    more = evaluate_rendering(other, run_of(config), max_frames=1, all_returns=True)
+    assert more["all_returns"] and not more["trained_on"] and more["depth_rays"] > 5 * result["depth_rays"]
 
 
 def test_all_returns_are_those_that_are_not_visible(config: PretrainConfig) -> None:

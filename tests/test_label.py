@@ -6,6 +6,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +25,7 @@ from pred.data.nuscenes import NuScenesFrames
 from pred.data_check import check_data
 from pred.label import LabelConfig, label
 from pred.label_train import LabelTrainConfig, class_weights, random_crop, train_segmenter
-from pred.run_folder import RunFolderError
+from pred.run_folder import RunFolderError, one_writer
 from pred.segmenter import cityscapes_channels, load_segmenter, probabilities_at
 from tests.data.tiny_tree import Tree, write_tree
 
@@ -205,36 +208,34 @@ def test_labels_at_lidar_pixels(model: Path, tree: Tree) -> None:
     assert check_data(tree.root, tree.tables.name, "pseudo/tiny").num_problems == 0
 
 
-def test_interrupted_and_continued(model: Path, tree: Tree, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_and_continued(model: Path, tree: Tree) -> None:
     config = LabelConfig(model=str(model), data=DataConfig(root=str(tree.root)), previews=2)
     label(config)
     folder = tree.root / "pseudo" / "tiny"
     whole = files(folder)
     shutil.rmtree(folder)
 
-    import pred.label
-
-    write, count = pred.label._write, 0
-
-    def dying(*arguments: Any) -> Any:
-        nonlocal count
-        count += 1
-        if count == 4:
-            raise KeyboardInterrupt
-        return write(*arguments)
-
-    monkeypatch.setattr(pred.label, "_write", dying)
-    with pytest.raises(KeyboardInterrupt):
-        label(config)
-    monkeypatch.setattr(pred.label, "_write", write)
+    command = [sys.executable, "-m", "pred", "label", "--model", str(model), "--data.root", str(tree.root)]
+    with subprocess.Popen([*command, "--previews", "2"], stdout=subprocess.DEVNULL) as process:
+        while process.poll() is None and len(list(folder.glob("CAM_*/*.npz"))) < 2:
+            time.sleep(0.001)
+        process.kill()
+    kept = len(list(folder.glob("CAM_*/*.npz")))
+    assert kept >= 2
     label_file = next(folder.glob("CAM_*/*.npz"))
     label_file.write_bytes(label_file.read_bytes()[:-9])  # a disk's fault, not a kill's
-    (folder / "CAM_BACK" / f".{label_file.name}.77.partial").touch()
+    label_file.with_name(f".{label_file.name}.77.partial").touch()
     statistics = label(config)
-    assert statistics.kept == 2 and statistics.images == 8
-    (folder / "CAM_BACK" / f".{label_file.name}.77.partial").unlink(missing_ok=True)
-    assert files(folder) == whole
+    assert statistics.kept == kept - 1 and statistics.images == 8
+    assert files(folder) == whole and not list(folder.rglob("*.partial"))
     assert label(config).kept == 8
+
+
+def test_one_writer(model: Path, tree: Tree) -> None:
+    config = LabelConfig(model=str(model), data=DataConfig(root=str(tree.root)), previews=0)
+    with one_writer(config.folder), pytest.raises(RunFolderError, match="tiny: must have one writer, got another"):
+        label(config)
+    assert label(config).images == 8
 
 
 def test_other_settings_are_refused(model: Path, tree: Tree, capsys: pytest.CaptureFixture[str]) -> None:

@@ -41,7 +41,8 @@ from pred.data.world.nuscenes_writer import (
     make_token,
 )
 from pred.data.world.sensors import CALIBRATED_MOUNTS, T_EGO_FROM_LIDAR, mounted_camera
-from pred.world import WorldFolderError, make_world
+from pred.run_folder import RunFolderError
+from pred.world import make_world
 from tests.data.fake_drive import (
     ACTORS,
     BEHIND_TRUCK,
@@ -643,26 +644,26 @@ def test_complete_world_is_left_alone(root: Path, capfd: pytest.CaptureFixture[s
 )
 def test_other_settings_are_refused(root: Path, change: dict[str, Any], text: str) -> None:
     before = tree(root)
-    with pytest.raises(WorldFolderError, match=text):
+    with pytest.raises(RunFolderError, match=text):
         make_world(root, WorldSettings(**{**vars(SETTINGS), **change}), workers=1, make_drive=FakeDrive)
     assert tree(root) == before
 
 
 def test_foreign_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(WorldFolderError, match="must be new or empty, or hold an interrupted world, got file"):
+    with pytest.raises(RunFolderError, match="must be new or empty, or hold an interrupted world, got file"):
         make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
-    with pytest.raises(WorldFolderError, match="file: must be a folder, got a file"):
+    with pytest.raises(RunFolderError, match="file: must be a folder, got a file"):
         make_world(tmp_path / "file", SMALL, workers=1, make_drive=FakeDrive)
     interrupted = tmp_path / "interrupted"
     with pytest.raises(ValueError, match="category and attribute of actor 1 must be official names"):
         make_world(interrupted, SMALL, workers=1, make_drive=MisnamedDrive)
     (interrupted / "notes.txt").touch()
-    with pytest.raises(WorldFolderError, match=r"must hold nothing but the interrupted world, got notes\.txt"):
+    with pytest.raises(RunFolderError, match=r"must hold nothing but the interrupted world, got notes\.txt"):
         make_world(interrupted, SMALL, workers=1, make_drive=FakeDrive)
     (interrupted / "notes.txt").unlink()
     (interrupted / "world.json").write_text("{")
-    with pytest.raises(WorldFolderError, match=r"world\.json: must be the settings of a world, got no valid JSON"):
+    with pytest.raises(RunFolderError, match=r"world\.json: must be the settings of a world, got no valid JSON"):
         make_world(interrupted, SMALL, workers=1, make_drive=FakeDrive)
 
 
@@ -671,7 +672,7 @@ def test_second_writer_is_refused(tmp_path: Path) -> None:
     folder = os.open(tmp_path, os.O_RDONLY)
     fcntl.flock(folder, fcntl.LOCK_EX)
     try:
-        with pytest.raises(WorldFolderError, match="must have one writer, got another process"):
+        with pytest.raises(RunFolderError, match="must have one writer, got another process"):
             make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
     finally:
         os.close(folder)
@@ -688,7 +689,7 @@ def test_other_libraries(tmp_path: Path, small: dict[str, str], monkeypatch: pyt
     other = {"embreex": "0.0.1", "numpy": "0.0.1", "pillow": "0.0.1"}
     with monkeypatch.context() as patch:
         patch.setattr("pred.world._libraries", lambda: other)
-        with pytest.raises(WorldFolderError, match=r"libraries must be \{'embreex': '0\.0\.1'.* as here, got"):
+        with pytest.raises(RunFolderError, match=r"libraries must be \{'embreex': '0\.0\.1'.* as here, got"):
             make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
     make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
     assert tree(tmp_path) == small
