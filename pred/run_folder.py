@@ -23,7 +23,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
@@ -136,21 +136,24 @@ def one_writer(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def claim_settings(path: Path, wanted: Mapping[str, Any]) -> None:
+def claim_settings(path: Path, wanted: Mapping[str, Any], ignored: Collection[str] = ()) -> None:
     """Make the folder of ``path`` that of a job with these settings, or check that it is.
+
+    Args:
+        path: where the settings are kept, as JSON.
+        wanted: settings of this job.
+        ignored: names of settings that may differ.
 
     Raises:
         RunFolderError: it holds a job with other settings, or foreign files. The text names what differs.
     """
     folder = path.parent
+    if folder.exists() and not folder.is_dir():
+        raise RunFolderError(f"{folder}: must be a folder, got a file")
     if not path.is_file():
-        held = (
-            [file.name for file in folder.iterdir() if not file.name.endswith(TEMPORARY_SUFFIX)]
-            if folder.is_dir()
-            else []
-        )
-        if folder.exists() and (held or not folder.is_dir()):
-            raise RunFolderError(f"{folder}: must be a new folder, got one that holds {(held or ['a file'])[0]}")
+        held = sorted(file.name for file in folder.glob("*") if not file.name.endswith(TEMPORARY_SUFFIX))
+        if held:
+            raise RunFolderError(f"{folder}: must be new or empty, or hold {path.name}, got {held[0]}")
         folder.mkdir(parents=True, exist_ok=True)
         write_json(path, wanted)
         return
@@ -159,10 +162,10 @@ def claim_settings(path: Path, wanted: Mapping[str, Any]) -> None:
     except ValueError as error:
         raise RunFolderError(f"{path}: must be the settings of the job, got no valid JSON: {error}") from None
     wanted = json.loads(json.dumps(wanted))
-    for name in sorted({*wanted, *found} if isinstance(found, dict) else wanted):
+    for name in sorted({*wanted, *found} - {*ignored} if isinstance(found, dict) else wanted):
         value = found.get(name) if isinstance(found, dict) else None
         if value != wanted.get(name):
-            raise RunFolderError(f"{path}: {name} must be {wanted.get(name)!r} as asked for, got {value!r}")
+            raise RunFolderError(f"{folder}: {name} must be {value!r} as in {path.name}, got {wanted.get(name)!r}")
 
 
 def environment() -> dict[str, Any]:

@@ -37,7 +37,7 @@ from pred.data import index
 from pred.data.world.nuscenes_writer import Part, WorldSettings, write_dataset, write_keyframe
 from pred.data.world.once_layout import once_splits, sequence_name, write_sequence, write_splits
 from pred.progress import Progress, format_duration
-from pred.run_folder import RunFolderError, one_writer
+from pred.run_folder import RunFolderError, claim_settings, one_writer
 
 Job = tuple[int, ...]
 MakeDrive = Callable[[int, int, int], Any]
@@ -197,28 +197,12 @@ def _claim(out: Path, settings: WorldSettings, work: _Work) -> None:
     """Make the folder the settings' own, or check that it is."""
     record = out / "world.json"
     wanted = {**asdict(settings), "made_by": f"pred {pred.__version__}", "libraries": _libraries()}
-    held = sorted(path.name for path in out.iterdir())
-    if not record.is_file():
-        foreign = [name for name in held if not name.startswith(f".{record.name}.")]
-        if foreign:
-            raise RunFolderError(f"{out}: must be new or empty, or hold an interrupted world, got {foreign[0]}")
-        write_text(record, json.dumps(wanted, indent=2) + "\n")
+    if work.is_complete():  # no more files of the world come; other jobs may add theirs
+        claim_settings(record, wanted, ignored=("libraries",))
         return
-    try:
-        found = json.loads(record.read_text())
-    except ValueError as error:
-        raise RunFolderError(f"{record}: must be the settings of a world, got no valid JSON: {error}") from None
-    complete = work.is_complete()
-    for name in wanted:
-        if name == "libraries" and complete:  # no more files come
-            continue
-        value = found.get(name) if isinstance(found, dict) else None
-        if value != wanted[name]:
-            source = "here" if name in ("libraries", "made_by") else "asked for"
-            raise RunFolderError(f"{record}: {name} must be {wanted[name]!r} as {source}, got {value!r}")
-    if complete:  # other jobs may add to it
-        return
+    claim_settings(record, wanted)
     own = {record.name, ".parts", index.FILE_NAME, *work.folders}
+    held = sorted(path.name for path in out.iterdir())
     foreign = [name for name in held if name not in own and not name.endswith(TEMPORARY_SUFFIX)]
     if foreign:
         raise RunFolderError(f"{out}: must hold nothing but the interrupted world, got {foreign[0]}")

@@ -243,12 +243,12 @@ def test_other_settings_are_refused(model: Path, tree: Tree, capsys: pytest.Capt
     assert main(arguments) == 0
     assert "mean confidence" in capsys.readouterr().out
     assert main([*arguments, "--size", "[32, 18]"]) == 1
-    assert "settings.json: size must be [32, 18] as asked for, got None" in capsys.readouterr().err
+    assert "size must be None as in settings.json, got [32, 18]" in capsys.readouterr().err
     assert main([*arguments, "--size", "[32, 18]", "--out", "small"]) == 0
     foreign = tree.root / "pseudo" / "foreign"
     foreign.mkdir()
     (foreign / "mine.txt").touch()
-    with pytest.raises(RunFolderError, match=r"foreign: must be a new folder, got one that holds mine\.txt"):
+    with pytest.raises(RunFolderError, match=r"foreign: must be new or empty, or hold settings\.json, got mine\.txt"):
         label(LabelConfig(model=str(model), out="foreign", data=DataConfig(root=str(tree.root))))
 
 
@@ -320,7 +320,7 @@ def test_killed_training_ends_in_the_same_bits(coloured: Tree, tmp_path: Path, m
     monkeypatch.setattr(pred.label_train, "make_batch", make_batch)
     resumed = train_segmenter(config)
     assert (resumed / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
-    with pytest.raises(RunFolderError, match=r"settings.json: lr must be 0.5 as asked for, got 0.003"):
+    with pytest.raises(RunFolderError, match=r"lr must be 0\.003 as in settings\.json, got 0\.5"):
         train_segmenter(train_config(coloured, tmp_path / "broken", lr=0.5))
 
 

@@ -636,10 +636,10 @@ def test_complete_world_is_left_alone(root: Path, capfd: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"seed": 8}, r"world\.json: seed must be 8 as asked for, got 7"),
-        ({"scenes": 3}, r"world\.json: scenes must be 3 as asked for, got 2"),
-        ({"image_scale": 0.1}, r"world\.json: image_scale must be 0\.1 as asked for, got 0\.05"),
-        ({"exact_labels": False}, r"world\.json: exact_labels must be False as asked for, got True"),
+        ({"seed": 8}, r"seed must be 7 as in world\.json, got 8"),
+        ({"scenes": 3}, r"scenes must be 2 as in world\.json, got 3"),
+        ({"image_scale": 0.1}, r"image_scale must be 0\.05 as in world\.json, got 0\.1"),
+        ({"exact_labels": False}, r"exact_labels must be True as in world\.json, got False"),
     ],
 )
 def test_other_settings_are_refused(root: Path, change: dict[str, Any], text: str) -> None:
@@ -651,7 +651,7 @@ def test_other_settings_are_refused(root: Path, change: dict[str, Any], text: st
 
 def test_foreign_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(RunFolderError, match="must be new or empty, or hold an interrupted world, got file"):
+    with pytest.raises(RunFolderError, match=r"must be new or empty, or hold world\.json, got file"):
         make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
     with pytest.raises(RunFolderError, match="file: must be a folder, got a file"):
         make_world(tmp_path / "file", SMALL, workers=1, make_drive=FakeDrive)
@@ -663,7 +663,7 @@ def test_foreign_folders_are_refused(tmp_path: Path) -> None:
         make_world(interrupted, SMALL, workers=1, make_drive=FakeDrive)
     (interrupted / "notes.txt").unlink()
     (interrupted / "world.json").write_text("{")
-    with pytest.raises(RunFolderError, match=r"world\.json: must be the settings of a world, got no valid JSON"):
+    with pytest.raises(RunFolderError, match=r"world\.json: must be the settings of the job, got no valid JSON"):
         make_world(interrupted, SMALL, workers=1, make_drive=FakeDrive)
 
 
@@ -689,7 +689,7 @@ def test_other_libraries(tmp_path: Path, small: dict[str, str], monkeypatch: pyt
     other = {"embreex": "0.0.1", "numpy": "0.0.1", "pillow": "0.0.1"}
     with monkeypatch.context() as patch:
         patch.setattr("pred.world._libraries", lambda: other)
-        with pytest.raises(RunFolderError, match=r"libraries must be \{'embreex': '0\.0\.1'.* as here, got"):
+        with pytest.raises(RunFolderError, match=r"libraries must be .* as in world\.json, got \{'embreex': '0\.0\.1'"):
             make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
     make_world(tmp_path, SMALL, workers=1, make_drive=FakeDrive)
     assert tree(tmp_path) == small
