@@ -27,7 +27,7 @@ from rich.console import Console
 
 from pred.data import folder as own
 from pred.data import nuscenes, once
-from pred.data.frame import FrameError, check_image_header, open_image, rgb_image_size
+from pred.data.frame import FrameError, check_image_header, read_rgb, rgb_image_size
 from pred.data.index import FrameIndex
 from pred.data.labels import PseudoLabel, find_label_file, label_folder
 from pred.data.tables import Row, read_json, read_table, reading_progress
@@ -393,7 +393,7 @@ def _check_image(image: Path, size: tuple[int, int] | None, required: bool, fast
     else:
         check_image_header(image, *size)
     if not fast:
-        open_image(image)
+        read_rgb(image)
 
 
 def _check_label(folder: Path, stem: str, width: int, height: int, fast: bool) -> None:

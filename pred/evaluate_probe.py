@@ -150,7 +150,7 @@ def evaluate_probe(
             bev = encode(network, points, offsets)
             if cells is None:
                 cells = draw_cells(
-                    labelled_cells(frame, config.point_range, config.data.ego_box, bev.shape[1:]),
+                    labelled_cells(frame, config.point_range, config.data.own_car, bev.shape[1:]),
                     cells_per_frame,
                     numpy_generator(config.train.seed, frame.token, "probe cells"),
                 )
@@ -169,7 +169,7 @@ def evaluate_probe(
         points, offsets = whole_scan(frame, config, device)
         for name, network in networks.items():
             bev = encode(network, points, offsets)
-            cells = labelled_cells(frame, config.point_range, config.data.ego_box, bev.shape[1:])
+            cells = labelled_cells(frame, config.point_range, config.data.own_car, bev.shape[1:])
             predicted = probes[name].predict(features_at(bev, cells))
             confusions[name].add(cells.merged, predicted.cpu().numpy())
         num_val_frames += 1
@@ -222,7 +222,7 @@ def _split_source(config: PretrainConfig, split: str, max_frames: int | None) ->
 
 def whole_scan(frame: Frame, config: PretrainConfig, device: torch.device) -> tuple[Tensor, Tensor]:
     """Points [N, 5] of a frame without the own car's returns, nothing hidden, and their offsets [2]."""
-    seen = frame.points[~frame.is_keyframe | outside_ego_box(frame.points, config.data.ego_box)]
+    seen = frame.points[~frame.is_keyframe | outside_ego_box(frame.points, config.data.own_car)]
     return torch.from_numpy(seen).to(device), torch.tensor([0, len(seen)], device=device)
 
 

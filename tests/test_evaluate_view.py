@@ -304,7 +304,7 @@ def test_all_returns_are_those_that_are_not_visible(config: PretrainConfig) -> N
     every = evaluation_rows(frame, config.data, config.point_range, seed=0, all_returns=True)
     assert (every.visible == held_out.visible).all()
     assert not set(every.visible) & set(every.returns) and set(held_out.returns) < set(every.returns)
-    inside = inside_range(frame.points, config.point_range) & outside_ego_box(frame.points, config.data.ego_box)
+    inside = inside_range(frame.points, config.point_range) & outside_ego_box(frame.points, config.data.own_car)
     inside &= np.linalg.norm(frame.points[:, :3], axis=1) > 1.0
     expected = set(np.flatnonzero(inside & frame.is_keyframe)) - set(every.visible)
     assert set(every.returns) == expected

@@ -21,7 +21,7 @@ from rich.progress import track
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from pred.data.frame import NUM_CLASSES, Frame, FrameError, FrameSource
+from pred.data.frame import EGO_BOX, NUM_CLASSES, ONCE_EGO_BOX, EgoBox, Frame, FrameError, FrameSource
 from pred.data.masking import MaskStrategy, bev_patches, farthest_point_groups, visible_parts, visible_points
 from pred.data.rays import (
     NEAR_M,
@@ -95,8 +95,9 @@ class DataConfig:
     """Groups of a frame (group only)."""
     holdout_fraction: float = 0.1
     """Share of the keyframe returns that training never uses, neither as input nor as target."""
-    ego_box: tuple[float, float, float, float] = (-1.0, -2.0, 1.0, 3.0)
-    """Returns of the own car: (x_min, y_min, x_max, y_max), metres, LiDAR frame."""
+    ego_box: EgoBox | None = None
+    """Returns of the own car: (x_min, y_min, x_max, y_max), metres, LiDAR frame. None: nuScenes's, (-1, -2, 1, 3), or
+    the same in ONCE's axes, (-1, -3, 1, 2)."""
     semantic_rays_per_camera: int = 512
     """Semantic rays drawn for every camera image."""
     depth_rays: int = 3072
@@ -138,9 +139,16 @@ class DataConfig:
         for name in ("mask_ratio", "holdout_fraction"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"data.{name} must be in [0, 1), got {getattr(self, name)}")
-        x_min, y_min, x_max, y_max = self.ego_box
+        x_min, y_min, x_max, y_max = self.own_car
         if not (x_min <= x_max and y_min <= y_max):
             raise ValueError(f"data.ego_box must be (x_min, y_min, x_max, y_max), got {self.ego_box}")
+
+    @property
+    def own_car(self) -> EgoBox:
+        """`ego_box`, or the default for the axes of `dataset`."""
+        if self.ego_box is not None:
+            return self.ego_box
+        return ONCE_EGO_BOX if self.dataset == "once" else EGO_BOX
 
 
 class _Parcel:
@@ -407,7 +415,7 @@ def build_source(config: DataConfig, point_classes: bool = False) -> FrameSource
             config.root,
             split=config.split,
             labels=config.labels,
-            ego_box=config.ego_box,
+            ego_box=config.own_car,
             undistort=config.undistort,
         )
     if config.dataset == "folder":
@@ -418,7 +426,7 @@ def build_source(config: DataConfig, point_classes: bool = False) -> FrameSource
             split=config.split,
             sweeps=config.sweeps,
             labels=config.labels,
-            ego_box=config.ego_box,
+            ego_box=config.own_car,
             image_depth=config.image_depth,
         )
     from pred.data.nuscenes import NuScenesFrames
@@ -429,7 +437,7 @@ def build_source(config: DataConfig, point_classes: bool = False) -> FrameSource
         split=config.split,
         sweeps=config.sweeps,
         labels=config.labels,
-        ego_box=config.ego_box,
+        ego_box=config.own_car,
         info=config.info,
         image_depth=config.image_depth,
         point_classes=point_classes,
@@ -481,7 +489,7 @@ def evaluation_rows(
     Args:
         all_returns: aim at every return of the keyframe that is not visible. On frames of the training that is no test.
     """
-    use = point_use(frame, point_range, config.ego_box, config.holdout_fraction)
+    use = point_use(frame, point_range, config.own_car, config.holdout_fraction)
     candidates = np.flatnonzero(use.input)
     rng = numpy_generator(seed, frame.token, "evaluation mask")
     visible = candidates[_visible(frame.points[candidates], config, point_range, rng)]
@@ -571,7 +579,7 @@ def _candidates(frame: Frame, config: DataConfig, point_range: PointRange, near_
     return frame_candidates(
         frame,
         point_range,
-        config.ego_box,
+        config.own_car,
         config.holdout_fraction,
         depth_view=config.depth_view,
         near_m=near_m,

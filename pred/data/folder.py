@@ -28,7 +28,9 @@ from numpy.typing import NDArray
 
 from pred.config import did_you_mean
 from pred.data.frame import (
+    EGO_BOX,
     Camera,
+    EgoBox,
     Frame,
     FrameError,
     check_image_header,
@@ -119,7 +121,7 @@ class FolderFrames:
         split: str | None = None,
         sweeps: int = 10,
         labels: str | None = "auto",
-        ego_box: tuple[float, float, float, float] = (-1.0, -2.0, 1.0, 3.0),
+        ego_box: EgoBox = EGO_BOX,
         image_depth: str | None = None,
     ) -> None:
         self.root = Path(root)

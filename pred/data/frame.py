@@ -298,6 +298,14 @@ def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     return -unit if unit[0] < 0 else unit
 
 
+EgoBox = tuple[float, float, float, float]
+"""(x_min, y_min, x_max, y_max) of the own car, metres, LiDAR frame."""
+EGO_BOX: EgoBox = (-1.0, -2.0, 1.0, 3.0)
+"""The own car of nuScenes, in its axes: x right, y forward."""
+ONCE_EGO_BOX: EgoBox = (-1.0, -3.0, 1.0, 2.0)
+"""The same in the axes of ONCE: x left, y back."""
+
+
 def inside_range(points: NDArray[Any], point_range: tuple[float, ...]) -> NDArray[np.bool_]:
     """[N] mask of points (columns x, y, z, ...) in (x_min, y_min, z_min, x_max, y_max, z_max).
 
@@ -316,19 +324,31 @@ def outside_ego_box(points: NDArray[Any], ego_box: tuple[float, ...]) -> NDArray
     return ~((x > x_min) & (x < x_max) & (y > y_min) & (y < y_max))
 
 
-def open_image(path: Path, decode: bool = True) -> Image.Image:
-    """Open an image file and decode it, or read its header only; every way in which that fails
-    becomes a `FrameError`."""
+def open_image(path: Path) -> Image.Image:
+    """Open an image file and read its header; every way in which that fails becomes a `FrameError`."""
     try:
-        image = Image.open(path)
-        if decode:
-            image.load()
+        return Image.open(path)
     except FileNotFoundError:
         raise FrameError(path, "image file must exist, got no such file") from None
-    # Pillow reports damage as OSError, SyntaxError, ValueError, EOFError, struct.error, ...
     except Exception as error:
-        raise FrameError(path, f"image file must be readable, got {type(error).__name__}: {error}") from None
-    return image
+        raise _unreadable_image(path, error) from None
+
+
+def decode_image(path: Path, image: Image.Image) -> NDArray[Any]:
+    """Pixels of the image that `open_image` has opened; damage is a `FrameError`.
+
+    Check the size first: a file of a few bytes can claim gigabytes of pixels.
+    """
+    try:
+        image.load()
+    except Exception as error:
+        raise _unreadable_image(path, error) from None
+    return np.asarray(image)
+
+
+def _unreadable_image(path: Path, error: Exception) -> FrameError:
+    # Pillow reports damage as OSError, SyntaxError, ValueError, EOFError, struct.error, ...
+    return FrameError(path, f"image file must be readable, got {type(error).__name__}: {error}")
 
 
 def rgb_image_size(path: Path) -> tuple[int, int]:
@@ -337,7 +357,7 @@ def rgb_image_size(path: Path) -> tuple[int, int]:
     Raises:
         FrameError: it is missing, no image, or not RGB.
     """
-    with open_image(path, decode=False) as image:
+    with open_image(path) as image:
         size, mode = image.size, image.mode
     if mode != "RGB":
         raise FrameError(path, f"image must have mode RGB, got {mode}")
@@ -350,7 +370,7 @@ def check_image_header(path: Path, width: int, height: int) -> None:
     Raises:
         FrameError: it is missing, no image, or not RGB of ``width`` x ``height`` pixels.
     """
-    with open_image(path, decode=False) as image:
+    with open_image(path) as image:
         size, mode = image.size, image.mode
     if (size, mode) != ((width, height), "RGB"):
         raise FrameError(
@@ -363,7 +383,7 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
     with open_image(path) as image:
         if image.mode != "RGB":
             raise FrameError(path, f"image must have mode RGB, got {image.mode}")
-        return np.asarray(image)
+        return decode_image(path, image)
 
 
 def _matrix(value: Any, size: int, what: str) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pred.data.frame import FrameError, open_image
+from pred.data.frame import FrameError, decode_image, open_image
 
 VALUES_PER_M = 256.0
 
@@ -56,7 +56,7 @@ class DepthMap:
                     f"depth map must have its image's {self.width} x {self.height} pixels, "
                     f"got {image.size[0]} x {image.size[1]}",
                 )
-            return np.asarray(image, dtype=np.uint16)
+            return decode_image(self.path, image).astype(np.uint16, copy=False)
 
 
 def depth_folder(root: Path, image_depth: str | None) -> Path | None:

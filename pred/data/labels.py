@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pred.data import soft_labels
-from pred.data.frame import NUM_CLASSES, FrameError, open_image
+from pred.data.frame import NUM_CLASSES, FrameError, decode_image, open_image
 from pred.data.soft_labels import SoftLabels
 
 IGNORED_CLASS_IDS = (19, 255)
@@ -29,6 +29,9 @@ PROBABILITIES_KEY = "probabilities"
 SOFT_KEYS = (soft_labels.SHAPE, soft_labels.STEPS, soft_labels.CODES)
 LABEL_SUFFIXES = (".png", ".npy", ".npz")
 MAX_PROBABILITY_SUM = 1.01  # room for float16 rounding
+
+CheckHeader = Callable[[tuple[int, ...], np.dtype[Any]], None]
+"""Raises for the shape and type of a label that cannot be used, before anything is allocated for it."""
 
 
 class LabelLookup(NamedTuple):
@@ -101,7 +104,7 @@ class PseudoLabel:
         if not isinstance(self.source, Path):
             label_map = np.asarray(self.source() if callable(self.source) else self.source)
         elif self.source.suffix == ".png":
-            label_map = _read_png(self.source)
+            label_map = _read_png(self.source, self._check_header)
         elif self.source.suffix == ".npy":
             label_map = _map_npy(self.source)
         elif self.source.suffix == ".npz":
@@ -226,14 +229,15 @@ def _hard_lookup(class_ids: NDArray[np.uint8]) -> LabelLookup:
     return LabelLookup(target, labelled.astype(np.float32), class_id)
 
 
-def _read_png(path: Path) -> NDArray[np.uint8]:
+def _read_png(path: Path, check_header: CheckHeader) -> NDArray[Any]:
     with open_image(path) as image:
         if image.format != "PNG" or image.mode not in ("P", "L"):
             raise FrameError(
                 path,
                 f"label must be a PNG of mode P (palette) or L (8-bit grey), got {image.format} of mode {image.mode}",
             )
-        return np.asarray(image)
+        check_header((image.height, image.width), np.dtype(np.uint8))
+        return decode_image(path, image)
 
 
 def _map_npy(path: Path) -> NDArray[Any]:
@@ -249,7 +253,7 @@ def _map_npy(path: Path) -> NDArray[Any]:
 
 def _read_npz(
     path: Path,
-    check_header: Callable[[tuple[int, ...], np.dtype[Any]], None],
+    check_header: CheckHeader,
     check_grid: Callable[[tuple[int, ...]], None],
 ) -> NDArray[Any] | SoftLabels:
     try:

@@ -19,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pred.data.frame import (
+    EGO_BOX,
     Boxes,
     Camera,
+    EgoBox,
     Frame,
     FrameError,
     check_image_header,
@@ -98,7 +100,7 @@ class NuScenesFrames(IndexedFrames):
         split: str | None = None,
         sweeps: int = 10,
         labels: str | None = "auto",
-        ego_box: tuple[float, float, float, float] = (-1.0, -2.0, 1.0, 3.0),
+        ego_box: EgoBox = EGO_BOX,
         info: str | Path | None = None,
         image_depth: str | None = None,
         point_classes: bool = False,

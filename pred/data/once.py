@@ -26,8 +26,10 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from pred.data.frame import (
+    ONCE_EGO_BOX,
     Boxes,
     Camera,
+    EgoBox,
     Frame,
     FrameError,
     invert_rigid,
@@ -59,8 +61,6 @@ CAMERAS = ("cam01", "cam03", "cam05", "cam06", "cam07", "cam08", "cam09")
 CLASSES = ("Car", "Truck", "Bus", "Pedestrian", "Cyclist")
 LIDAR = "lidar_roof"
 SCAN_COLUMNS = ("x", "y", "z", "intensity")
-EGO_BOX = (-1.0, -3.0, 1.0, 2.0)
-"""(x_min, y_min, x_max, y_max), metres: nuScenes's box for the own car, in these axes."""
 PIXEL_CENTRE = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 """Added to intrinsics of the data set, which are OpenCV's, with pixel centres at whole numbers; in
 `pred.data.frame.Camera` they are at halves."""
@@ -118,7 +118,7 @@ class OnceFrames(IndexedFrames):
         root: str | Path,
         split: str | None = None,
         labels: str | None = "auto",
-        ego_box: tuple[float, float, float, float] = EGO_BOX,
+        ego_box: EgoBox = ONCE_EGO_BOX,
         undistort: bool = True,
     ) -> None:
         self.root = Path(root)

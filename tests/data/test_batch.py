@@ -28,7 +28,15 @@ from pred.data.batch import (
     evaluation_batch,
     make_loader,
 )
-from pred.data.frame import Camera, Frame, FrameError, inside_range, invert_rigid, transform_points
+from pred.data.frame import (
+    Camera,
+    Frame,
+    FrameError,
+    inside_range,
+    invert_rigid,
+    outside_ego_box,
+    transform_points,
+)
 from pred.data.labels import PseudoLabel
 from pred.data.masking import is_held_out
 from pred.data.nuscenes import NuScenesFrames
@@ -680,6 +688,16 @@ def test_evaluation_batch_with_nothing_held_out() -> None:
 def test_wrong_settings(changes: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         DataConfig(**changes)
+
+
+def test_own_car() -> None:
+    """nuScenes looks along y, ONCE along -y."""
+    points = np.array([[0.9, 2.9], [0.9, -1.9], [-0.9, 2.9], [0.0, -2.5]])
+    outside = [False, False, False, True]
+    assert outside_ego_box(points, DataConfig().own_car).tolist() == outside
+    assert outside_ego_box(points, DataConfig(dataset="folder").own_car).tolist() == outside
+    assert outside_ego_box(-points, DataConfig(dataset="once").own_car).tolist() == outside
+    assert DataConfig(dataset="once", ego_box=(0, 0, 1, 1)).own_car == (0, 0, 1, 1)
 
 
 def test_sources() -> None:

@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 import io
+import struct
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +109,16 @@ def test_missing_files(tmp_path: Path) -> None:
         label(tmp_path / "gone.jpg").lookup(CENTRES)
 
 
+def claimed_png(width: int, height: int) -> bytes:
+    """A PNG, 8-bit grey, whose header claims pixels that are not there: decoding it fails."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", b"") + chunk(b"IEND", b"")
+
+
 def test_unusable_png(tmp_path: Path) -> None:
     path = tmp_path / "label.png"
 
@@ -126,6 +138,9 @@ def test_unusable_png(tmp_path: Path) -> None:
     Image.fromarray(big).save(path)
     path.write_bytes(path.read_bytes()[:20_000])
     with pytest.raises(FrameError, match=r"label\.png: image file must be readable, got"):
+        label(path).lookup(CENTRES)
+    path.write_bytes(claimed_png(9_000, 9_000))
+    with pytest.raises(FrameError, match=r"aspect ratio of its 8 x 4 image, got 9000 x 9000"):
         label(path).lookup(CENTRES)
     path.write_bytes(b"not an image")
     with pytest.raises(FrameError, match=r"label\.png: image file must be readable, got UnidentifiedImageError"):
