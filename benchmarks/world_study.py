@@ -5,7 +5,8 @@
 ``python -m benchmarks.world_study ROOT --out FOLDER`` trains `world_pillars` on the ``train`` split of a world (made
 with ``--exact-labels``) once per variant and seed, measures it on the ``val`` split by ``pred evaluate rendering``
 and ``pred evaluate probe``, prints tables in Markdown, and writes them with every figure as JSON. All variants have the
-same network, rays, steps and data; they differ in the options below. What is finished in FOLDER is not done again.
+same network, rays, steps and data; they differ in the options below. Further options go to `pred pretrain`, such as
+``--data.labels`` for labels of a segmenter in place of the perfect ones. What is finished in FOLDER is not done again.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from pred.run_folder import claim_settings, write_json
 EVALUATED_FRAMES = 16
 """Four of each unseen scene, for the rendering: each has some 60,000 rays."""
 DEPTH_MAPS = "--data.image_depth=depth/exact"
+PERFECT_LABELS = "--data.labels=pseudo/exact"
 VARIANTS = {
     "rendering": [],
     "projection": ["--loss.semantic_at=return"],
@@ -73,8 +75,8 @@ def run_variant(root: Path, run: Path, variant: str, seed: int, options: Sequenc
         if (run / "config.yaml").is_file():
             _pred("pretrain", "--resume", str(run))
         else:
-            new = [f"--data.root={root}", "--data.labels=pseudo/exact", f"--train.seed={seed}", f"--run={run}"]
-            _pred("pretrain", "--config=world_pillars", *options, *VARIANTS[variant], *new)
+            new = [f"--data.root={root}", f"--train.seed={seed}", f"--run={run}"]
+            _pred("pretrain", "--config=world_pillars", PERFECT_LABELS, *options, *VARIANTS[variant], *new)
     rendering, probe = run / "evaluation_rendering.json", run / "evaluation_probe.json"
     if not rendering.is_file():
         measured = ["--data.split=val", DEPTH_MAPS, "--all-returns", f"--frames={EVALUATED_FRAMES}"]
