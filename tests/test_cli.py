@@ -288,6 +288,8 @@ def test_nuscenes_pillars_has_the_papers_values() -> None:
         (["view", "started", "--frame", "2"], "frame must be in [0, 2), got 2"),
         (["view", "started", "--columns", "1"], "columns must be at least 2, got 1"),
         (["evaluate", "rendering", "started", "--frames", "0"], "frames must be at least 1, got 0"),
+        (["evaluate", "probe", "started", "--frames", "0"], "evaluate probe: frames must be at least 1, got 0"),
+        (["evaluate", "rendering", "started", "--data.split", "val"], "v1.0-world, got none: val"),
         (["evaluate", "rendering", "started", "--data.root", "null"], "data.root must name the folder"),
         (["evaluate", "rendering", "started", "--data.root", "no_data"], "no_data"),
     ],

@@ -14,6 +14,7 @@ from pred import cli
 from pred.data.batch import DataConfig
 from pred.data.frame import CLASS_NAMES, Frame, FrameError
 from pred.data.lidarseg import MERGED_NAMES, NUM_MERGED
+from pred.data.nuscenes import NuScenesFrames
 from pred.evaluate_probe import Cells, draw_cells, evaluate_probe, features_at, fit_probe, labelled_cells
 from pred.pretrain import PretrainConfig, pretrain
 from tests.data.tiny_tree import Tree, write_lidarseg, write_tree
@@ -161,5 +162,23 @@ def test_wrong_arguments_of_the_probe(config: PretrainConfig, tree: Tree, tmp_pa
     try:
         with pytest.raises(FrameError, match=r"frame must have classes of its points \(lidarseg\.json\), got none"):
             evaluate_probe(config, run, train_split="first", val_split="second")
+        skipping = replace(config, data=replace(config.data, on_error="skip"))
+        with pytest.raises(ValueError, match=r"split first must have cells of known class, got none; .*lidarseg\.json"):
+            evaluate_probe(skipping, run, train_split="first", val_split="second")
     finally:
         moved.rename(table)
+
+
+def test_no_usable_frame_to_measure_gives_no_figures(config: PretrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    load = NuScenesFrames.load
+
+    def load_the_first_scene(self: NuScenesFrames, index: int) -> Frame:
+        if "scene-b" in self.token(index):
+            raise FrameError("sweep.bin", "must hold points, got 3 bytes")
+        return load(self, index)
+
+    monkeypatch.setattr(NuScenesFrames, "load", load_the_first_scene)
+    monkeypatch.setattr(config.data, "on_error", "skip")
+    result = evaluate_probe(config, run_of(config), train_split="first", val_split="second", cells_per_frame=20)
+    assert (result["train_frames"], result["val_frames"], len(result["skipped"])) == (2, 0, 2)
+    assert result["val_cells_by_class"] == {} and result["trained"]["miou"] is result["untrained"]["accuracy"] is None

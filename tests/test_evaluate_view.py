@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pred import cli
 from pred.data.batch import TrainingBatches, build_source, evaluation_batch, evaluation_rows
-from pred.data.frame import CLASS_NAMES, Boxes, Camera, Frame, inside_range, outside_ego_box
+from pred.data.frame import CLASS_NAMES, Boxes, Camera, Frame, FrameError, inside_range, outside_ego_box
 from pred.data.image_depth import DepthMap
 from pred.data.labels import PseudoLabel
 from pred.data.lidarseg import MERGED_NAMES
@@ -194,8 +194,6 @@ def test_rays_nearer_than_near_m_are_not_evaluated(config: PretrainConfig, monke
 
 
 def test_broken_frames_are_skipped_on_request(config: PretrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pred.data.frame import FrameError
-
     load = NuScenesFrames.load
 
     def load_but_the_first(self: NuScenesFrames, index: int) -> Frame:
@@ -213,7 +211,33 @@ def test_broken_frames_are_skipped_on_request(config: PretrainConfig, monkeypatc
     }
 
 
+def test_no_usable_frame_gives_no_figures(config: PretrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def load_nothing(self: NuScenesFrames, index: int) -> Frame:
+        raise FrameError("sweep.bin", "must hold points, got 3 bytes")
+
+    monkeypatch.setattr(NuScenesFrames, "load", load_nothing)
+    monkeypatch.setattr(config.data, "on_error", "skip")
+    result = evaluate_rendering(config, run_of(config))
+    assert result["frames"] == result["depth_rays"] == result["semantic_rays"] == 0 and len(result["skipped"]) == 2
+    for name in ("trained", "untrained", "nearest_visible"):
+        assert result[name]["depth_mean_m"] is None and result[name]["depth_median_m"] is None
+    assert result["trained"]["depth_mean_over_nearest_visible"] is None
+    assert json.loads((run_of(config) / "evaluation_rendering.json").read_text()) == result
+
+
 # True classes of returns
+
+
+def test_data_without_classes_of_points_has_no_figures_of_them(
+    config: PretrainConfig, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    tree = write_tree(tmp_path / "data")
+    other = replace(config, data=replace(config.data, root=str(tree.root)))
+    result = evaluate_rendering(other, run_of(config))
+    assert result["depth_rays"] > 0 and result["semantic_rays"] > 0 and not result["trained_on"]
+    assert result["returns_by_class"] == result["projected_label"]["returns"] == {}
+    assert result["trained"]["returns"] == result["untrained"]["returns"] == {}
+    assert "class along the ray from the LiDAR" not in capfd.readouterr().out
 
 
 def test_pixels_that_show_a_nearer_surface() -> None:

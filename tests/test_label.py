@@ -19,14 +19,18 @@ import torch.nn.functional as F
 from PIL import Image
 
 from pred.cli import main
-from pred.data.batch import DataConfig
+from pred.data.batch import DataConfig, TrainingBatches, build_source
 from pred.data.frame import CLASS_NAMES, FrameError
 from pred.data.nuscenes import NuScenesFrames
+from pred.data.soft_labels import decode
+from pred.data.world.nuscenes_writer import WorldSettings
 from pred.data_check import check_data
 from pred.label import LabelConfig, label
 from pred.label_train import LabelTrainConfig, class_weights, random_crop, train_segmenter
 from pred.run_folder import RunFolderError, one_writer
 from pred.segmenter import cityscapes_channels, load_segmenter, probabilities_at
+from pred.world import make_world
+from tests.data.own_tree import write_own_tree
 from tests.data.tiny_tree import Tree, write_tree
 
 transformers = pytest.importorskip("transformers", reason="transformers is missing: pip install 'pred-lidar[label]'")
@@ -206,6 +210,53 @@ def test_labels_at_lidar_pixels(model: Path, tree: Tree) -> None:
             seen += len(uv)
     assert seen == statistics.class_counts.sum() > 100
     assert check_data(tree.root, tree.tables.name, "pseudo/tiny").num_problems == 0
+
+
+@pytest.fixture(params=["once", "folder"])
+def unlabelled(request: pytest.FixtureRequest, tmp_path: Path) -> DataConfig:
+    """A data set with images and no labels yet: a made drive in the ONCE layout, or own drives."""
+    root = tmp_path / "data"
+    if request.param == "once":
+        make_world(root, WorldSettings(scenes=1, keyframes=2, image_scale=0.05, layout="once"), workers=1)
+    else:
+        write_own_tree(root)
+        shutil.rmtree(root / "pseudo")
+    return DataConfig(
+        request.param, str(root), batch_size=2, semantic_rays_per_camera=20, depth_rays=50, mask_ratio=0.5, workers=0
+    )
+
+
+def test_batch_of_labels_of_other_layouts(model: Path, unlabelled: DataConfig) -> None:
+    """Every semantic ray bears what the file of its image says at the pixel that the ray goes through."""
+    arguments = ["--data.dataset", unlabelled.dataset, "--data.root", str(unlabelled.root), "--previews", "1"]
+    assert main(["label", "--model", str(model), *arguments]) == 0
+    folder = Path(str(unlabelled.root)) / "pseudo" / "tiny"
+    assert len(list((folder / "previews").glob("*.png"))) == 1
+    source = build_source(unlabelled)
+    batch = TrainingBatches(unlabelled, (-25.0, -25.0, -5.0, 25.0, 25.0, 5.0), seed=0, total_steps=1)[0]
+    assert batch.semantic is not None and batch.skipped == []
+    frames = {source.token(index): source.load(index) for index in range(len(source))}
+    assert batch.semantic.valid.sum(dim=1).min() >= 20
+    assert len(batch.semantic.target[batch.semantic.valid].unique(dim=0)) > 5
+    for place, token in enumerate(batch.tokens):
+        left = batch.semantic.valid[place].numpy().copy()
+        origins, directions = (
+            rays[place].double().numpy() for rays in (batch.semantic.origins, batch.semantic.directions)
+        )
+        returns = origins + directions * batch.semantic.range_m[place, :, None].numpy()
+        recording, _, stem = token.rpartition("_" if unlabelled.dataset == "once" else "/")
+        for camera in frames[token].cameras:
+            own = left & np.isclose(origins, camera.T_lidar_from_camera[:3, 3], rtol=0, atol=1e-5).all(axis=1)
+            stored = np.load(folder / recording / camera.name / f"{stem}.npz")
+            assert stored["shape"].tolist() == [camera.height, camera.width]
+            column, row = np.floor(camera.project(returns[own])[0]).astype(int).T
+            cells = np.cumsum(stored["steps"], dtype=np.int64).tolist()
+            at = [cells.index(cell) for cell in row * camera.width + column]  # nothing else may have a ray
+            expected = decode(stored["codes"][:, at])
+            np.testing.assert_array_equal(batch.semantic.target[place, own].numpy(), expected)
+            np.testing.assert_array_equal(batch.semantic.confidence[place, own].numpy(), expected.max(axis=1))
+            left &= ~own
+        assert not left.any()
 
 
 def test_killed_and_continued(model: Path, tree: Tree) -> None:

@@ -58,6 +58,7 @@ from tests.data.fake_drive import (
     MisnamedDrive,
     SlowDrive,
 )
+from tests.data.official_evaluation import check_perturbed, evaluate, evaluate_true_lidarseg
 
 SCENES, KEYFRAMES, SEED = 2, 4, 7
 WIDTH, HEIGHT = 80, 45
@@ -424,53 +425,6 @@ def test_maps(root: Path, devkit: Any) -> None:
 # Official evaluation
 
 
-def predictions(devkit: Any, split: str, change: Any) -> dict[str, Any]:
-    utils = pytest.importorskip("nuscenes.eval.detection.utils")
-    names = json.loads((Path(devkit.table_root) / "splits.json").read_text())[split]
-    results: dict[str, list[dict[str, Any]]] = {}
-    for sample in devkit.sample:
-        if devkit.get("scene", sample["scene_token"])["name"] not in names:
-            continue
-        boxes = results.setdefault(sample["token"], [])
-        for token in sample["anns"]:
-            annotation = devkit.get("sample_annotation", token)
-            name = utils.category_to_detection_name(annotation["category_name"])
-            if name is None or annotation["num_lidar_pts"] == 0:
-                continue
-            attributes = [devkit.get("attribute", attribute)["name"] for attribute in annotation["attribute_tokens"]]
-            box = {
-                "sample_token": sample["token"],
-                "translation": list(annotation["translation"]),
-                "size": list(annotation["size"]),
-                "rotation": list(annotation["rotation"]),
-                "velocity": devkit.box_velocity(token)[:2].tolist(),
-                "detection_name": name,
-                "detection_score": 1.0 - 1e-3 * len(boxes),
-                "attribute_name": attributes[0] if attributes else "",
-            }
-            change(box)
-            boxes.append(box)
-    meta = {f"use_{sensor}": sensor == "lidar" for sensor in ("camera", "lidar", "radar", "map", "external")}
-    return {"meta": meta, "results": results}
-
-
-def evaluate(devkit: Any, split: str, folder: Path, change: Any) -> dict[str, Any]:
-    config = pytest.importorskip("nuscenes.eval.common.config")
-    official = pytest.importorskip("nuscenes.eval.detection.evaluate")
-    (folder / "results.json").write_text(json.dumps(predictions(devkit, split, change)))
-    evaluation = official.DetectionEval(
-        devkit,
-        config.config_factory("detection_cvpr_2019"),
-        str(folder / "results.json"),
-        split,
-        str(folder / "evaluation"),
-        verbose=False,
-    )
-    metrics, _ = evaluation.evaluate()
-    found: dict[str, Any] = metrics.serialize()
-    return found
-
-
 @pytest.mark.parametrize("split", ["all", "world_val"])
 def test_perfect_predictions(devkit: Any, split: str, tmp_path: Path) -> None:
     found = evaluate(devkit, split, tmp_path, lambda box: None)
@@ -480,41 +434,18 @@ def test_perfect_predictions(devkit: Any, split: str, tmp_path: Path) -> None:
 
 
 def test_perturbed_predictions(devkit: Any, tmp_path: Path) -> None:
-    quaternion = pytest.importorskip("pyquaternion").Quaternion
-
-    def change(box: dict[str, Any]) -> None:
-        box["translation"][0] += 0.3
-        box["size"] = [1.1 * side for side in box["size"]]
-        box["rotation"] = (quaternion(axis=[0, 0, 1], radians=0.1) * quaternion(box["rotation"])).elements.tolist()
-        box["velocity"][1] += 0.4
-
-    found = evaluate(devkit, "all", tmp_path, change)
-    assert found["mean_ap"] == pytest.approx(1.0, abs=1e-6)
-    assert found["tp_errors"] == pytest.approx(
-        {"trans_err": 0.3, "scale_err": 1 - 1.1**-3, "orient_err": 0.1, "vel_err": 0.4, "attr_err": 0.0}, abs=1e-6
-    )
+    check_perturbed(devkit, tmp_path, shift_m=0.3)
 
 
 def test_mini_names_and_lidarseg_evaluation(tmp_path: Path) -> None:
     settings = WorldSettings(scenes=10, seed=3, keyframes=1, image_scale=0.02, version="v1.0-mini")
     make_world(tmp_path / "world", settings, workers=1, make_drive=FakeDrive)
     nuscenes = pytest.importorskip("nuscenes.nuscenes", reason="nuscenes-devkit is not installed")
-    official = pytest.importorskip("nuscenes.eval.lidarseg.evaluate")
     devkit = nuscenes.NuScenes("v1.0-mini", str(tmp_path / "world"), verbose=False)
     assert {scene["name"] for scene in devkit.scene} == set(MINI_SCENES)
     assert len(devkit.lidarseg) == 10
-    mapper = official.LidarsegClassMapper(devkit)
     for split in ("mini_train", "mini_val"):
-        folder = tmp_path / "results" / "lidarseg" / split
-        folder.mkdir(parents=True)
-        for record in devkit.lidarseg:
-            labels = np.fromfile(tmp_path / "world" / record["filename"], np.uint8)
-            points = devkit.get("sample_data", record["sample_data_token"])["filename"]
-            assert len(labels) * 20 == (tmp_path / "world" / points).stat().st_size
-            # Predictions have no class 0; points of this class do not count.
-            predicted = mapper.convert_label(labels).clip(1).astype(np.uint8)
-            predicted.tofile(folder / f"{record['sample_data_token']}_lidarseg.bin")
-        found = official.LidarSegEval(devkit, str(tmp_path / "results"), split).evaluate()
+        found = evaluate_true_lidarseg(devkit, split, tmp_path)
         assert found["miou"] == 1.0
         assert [name for name, iou in found["iou_per_class"].items() if np.isnan(iou)] == ["ignore"]
         assert len(NuScenesFrames(tmp_path / "world", split=split)) == (8 if split == "mini_train" else 2)
