@@ -53,7 +53,7 @@ $(VENV)/dev.stamp: $(VENV)/native.stamp
 demo: $(VENV)/native.stamp
 	$(BIN)/pred world make $(WORLD) --scenes 4 --keyframes 6 --exact-labels
 	if [ -e $(RUN)/config.yaml ]; then $(BIN)/pred pretrain --resume $(RUN) --data.root $(WORLD); \
-	else $(BIN)/pred pretrain --config world_pillars --data.root $(WORLD) --train.steps 2000 --run $(RUN); fi
+	else $(BIN)/pred pretrain --config world_pillars --data.root $(WORLD) --run $(RUN); fi
 	$(BIN)/pred evaluate rendering $(RUN)
 	$(BIN)/pred view $(RUN)
 	@echo "encoder weights: $(RUN)/encoder.pth    pictures: $(RUN)/pictures"
