@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -158,13 +158,13 @@ def evaluate_rendering(
         raise ValueError(f"evaluate: frames must be at least 1, got {max_frames}")
     folder = RunFolder(run)
     folder.require()
-    seen = trained_on(folder, config.data)
-    if all_returns and seen:
-        raise ValueError(
-            "evaluate: all_returns must go with frames that the run was not trained on, got the run's own; "
-            "name others, such as --data.split val"
-        )
     source = SpreadFrames(build_source(config.data, point_classes=True), max_frames)
+    trained_on = len(tokens_of(source) & trained_tokens(folder, config.data))
+    if all_returns and trained_on:
+        raise ValueError(
+            "evaluate: all_returns must go with frames that the run was not trained on, got "
+            f"{trained_on} of {len(source)} that it was; name others, such as --data.split val"
+        )
     device = pick_device(config.train)
     trained, checkpoint = load_model(config, folder, checkpoint)
     networks = {"trained": trained.to(device), "untrained": build_model(config).eval().to(device)}
@@ -195,7 +195,7 @@ def evaluate_rendering(
         "checkpoint": str(checkpoint),
         "root": config.data.root,
         "split": config.data.split,
-        "trained_on": seen,
+        "frames_trained_on": trained_on,
         "frames": len(source) - len(skipped),
         "skipped": skipped,
         "all_returns": all_returns,
@@ -222,12 +222,30 @@ def evaluate_rendering(
     return result
 
 
-def trained_on(folder: RunFolder, data: DataConfig) -> bool:
-    """Whether a run's own configuration names the frames of ``data``, or all of that data set."""
-    own = yaml.safe_load(folder.config.read_text())["data"]
-    same_set = all(own.get(key) == getattr(data, key) for key in ("dataset", "root", "version"))
-    every = own.get("split") is None and own.get("info") is None
-    return same_set and (every or (own.get("split"), own.get("info")) == (data.split, data.info))
+def tokens_of(source: FrameSource) -> set[str]:
+    """Identities of all frames of a source."""
+    return {source.token(index) for index in range(len(source))}
+
+
+def trained_tokens(folder: RunFolder, data: DataConfig) -> set[str]:
+    """Identities of the frames that a run's own configuration names, as far as they may be frames of ``data``.
+
+    Where the run's root is gone, its split is looked for under that of ``data``: the data set may have been moved.
+    """
+    own = DataConfig(**yaml.safe_load(folder.config.read_text())["data"])
+    own = replace(own, labels="none", sweeps=1, image_depth=None, depth_filter=None)
+    assert own.root is not None and data.root is not None
+    if own.dataset != data.dataset:
+        return set()
+    if not Path(own.root).is_dir():
+        try:
+            return tokens_of(build_source(replace(own, root=data.root, version=data.version)))
+        except (FrameError, ValueError):  # another data set, without such a split
+            return set()
+    # Frames of nuScenes have names of their own; those of other layouts repeat from one root to the next.
+    if own.dataset != "nuscenes" and Path(own.root).resolve() != Path(data.root).resolve():
+        return set()
+    return tokens_of(build_source(own))
 
 
 class SpreadFrames:

@@ -25,7 +25,7 @@ from pred.data.batch import PointRange, build_source
 from pred.data.frame import Frame, FrameError, FrameSource, inside_range, outside_ego_box
 from pred.data.lidarseg import MERGED_NAMES, NUM_MERGED, merged_classes
 from pred.data.rays import draw_class_balanced
-from pred.evaluate import Confusion, SpreadFrames, load_frames, percent, trained_on
+from pred.evaluate import Confusion, SpreadFrames, load_frames, percent, tokens_of, trained_tokens
 from pred.models.pretrainer import Pretrainer
 from pred.pretrain import (
     RECALIBRATION_BATCHES,
@@ -120,11 +120,16 @@ def evaluate_probe(
     if config.data.dataset != "nuscenes" or config.data.info is not None:
         got = f"{config.data.dataset} with data.info {config.data.info}"
         raise ValueError(f"evaluate probe: data.dataset must be nuscenes, with splits, got {got}")
-    if train_split == val_split:
-        raise ValueError(f"evaluate probe: val-split must be another than train-split, got {val_split} twice")
     folder = RunFolder(run)
     folder.require()
-    sources = {split: _split_source(config, split, max_frames) for split in (train_split, val_split)}
+    every = {split: _split_source(config, split) for split in (train_split, val_split)}
+    val_tokens = tokens_of(every[val_split])
+    if shared := len(tokens_of(every[train_split]) & val_tokens):
+        raise ValueError(
+            f"evaluate probe: train-split and val-split must have no frame in common, got {shared} in both "
+            f"{train_split} and {val_split}"
+        )
+    sources = {split: _ClassedFrames(source, max_frames) for split, source in every.items()}
     device = pick_device(config.train)
     trained, checkpoint = load_model(config, folder, checkpoint)
     networks = {"trained": trained.to(device), "untrained": build_model(config).eval().to(device)}
@@ -180,7 +185,7 @@ def evaluate_probe(
         "root": config.data.root,
         "train_split": train_split,
         "val_split": val_split,
-        "encoder_trained_on_val": trained_on(folder, replace(config.data, split=val_split)),
+        "val_frames_encoder_trained_on": len(val_tokens & trained_tokens(folder, config.data)),
         "cells_per_frame": cells_per_frame,
         "train_frames": len(classes),
         "val_frames": num_val_frames,
@@ -214,10 +219,10 @@ class _ClassedFrames(SpreadFrames):
         return frame
 
 
-def _split_source(config: PretrainConfig, split: str, max_frames: int | None) -> FrameSource:
+def _split_source(config: PretrainConfig, split: str) -> FrameSource:
     """Frames of a split with point classes and without labels of images."""
     data = replace(config.data, split=split, labels="none", image_depth=None, depth_filter=None)
-    return _ClassedFrames(build_source(data, point_classes=True), max_frames)
+    return build_source(data, point_classes=True)
 
 
 def whole_scan(frame: Frame, config: PretrainConfig, device: torch.device) -> tuple[Tensor, Tensor]:

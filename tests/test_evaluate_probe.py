@@ -132,7 +132,7 @@ def test_probe_of_a_run(config: PretrainConfig, capfd: pytest.CaptureFixture[str
     assert "linear probe" in output and "mIoU" in output and "IoU road (" in output
     result = json.loads((run_of(config) / "evaluation_probe.json").read_text())
     assert (result["train_frames"], result["val_frames"], result["skipped"]) == (2, 2, {})
-    assert not result["encoder_trained_on_val"]
+    assert result["val_frames_encoder_trained_on"] == 0
     assert sum(result["train_cells_by_class"].values()) == 40
     for name in ("trained", "untrained"):
         figures = result[name]
@@ -151,7 +151,7 @@ def test_wrong_arguments_of_the_probe(config: PretrainConfig, tree: Tree, tmp_pa
     run = run_of(config)
     with pytest.raises(ValueError, match="cells-per-frame must be at least 1, got 0"):
         evaluate_probe(config, run, cells_per_frame=0)
-    with pytest.raises(ValueError, match="val-split must be another than train-split, got first twice"):
+    with pytest.raises(ValueError, match="must have no frame in common, got 2 in both first and first"):
         evaluate_probe(config, run, train_split="first", val_split="first")
     with pytest.raises(ValueError, match=r"data\.split must select samples of .*, got none: train"):
         evaluate_probe(config, run)

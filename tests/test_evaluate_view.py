@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
 from pred import cli
+from pred.config import plain
 from pred.data.batch import TrainingBatches, build_source, evaluation_batch, evaluation_rows
 from pred.data.frame import CLASS_NAMES, Boxes, Camera, Frame, FrameError, inside_range, outside_ego_box
 from pred.data.image_depth import DepthMap
@@ -33,9 +35,11 @@ from pred.evaluate import (
     results_table,
     returns_of,
     shows_nearer_surface,
+    trained_tokens,
 )
 from pred.models.pretrainer import Pretrainer, RenderedView
 from pred.pretrain import PretrainConfig, pretrain
+from pred.run_folder import RunFolder
 from pred.view import (
     CLASS_COLOURS,
     FARTHEST_M,
@@ -53,8 +57,9 @@ from pred.view import (
     sdf_colours,
     view,
 )
+from pred.world import make_world
 from tests.data.tiny_tree import write_tree
-from tests.tiny_run import tiny_config
+from tests.tiny_run import WORLD, tiny_config
 
 
 @pytest.fixture(scope="module")
@@ -234,7 +239,7 @@ def test_data_without_classes_of_points_has_no_figures_of_them(
     tree = write_tree(tmp_path / "data")
     other = replace(config, data=replace(config.data, root=str(tree.root)))
     result = evaluate_rendering(other, run_of(config))
-    assert result["depth_rays"] > 0 and result["semantic_rays"] > 0 and not result["trained_on"]
+    assert result["depth_rays"] > 0 and result["semantic_rays"] > 0 and result["frames_trained_on"] == 0
     assert result["returns_by_class"] == result["projected_label"]["returns"] == {}
     assert result["trained"]["returns"] == result["untrained"]["returns"] == {}
     assert "class along the ray from the LiDAR" not in capfd.readouterr().out
@@ -312,14 +317,38 @@ def test_rendered_classes_are_compared_with_the_true_ones(config: PretrainConfig
     for name in ("trained", "untrained"):
         assert set(result[name]["returns"]) == set(counts)
     assert result["trained"]["returns"]["all"]["accuracy"] > result["untrained"]["returns"]["all"]["accuracy"]
-    assert result["trained_on"]
-    with pytest.raises(ValueError, match="all_returns must go with frames that the run was not trained on"):
-        evaluate_rendering(config, run_of(config), max_frames=1, all_returns=True)
-    elsewhere = tmp_path / "world"
-    elsewhere.symlink_to(str(config.data.root))
-    other = replace(config, data=replace(config.data, root=str(elsewhere)))
-    more = evaluate_rendering(other, run_of(config), max_frames=1, all_returns=True)
-    assert more["all_returns"] and not more["trained_on"] and more["depth_rays"] > 5 * result["depth_rays"]
+    assert result["frames_trained_on"] == 1
+
+
+def test_all_returns_of_unseen_frames_only(config: PretrainConfig, tmp_path: Path) -> None:
+    """Frames are known by their tokens, whatever their folder, split or version is called."""
+    link = tmp_path / "link"
+    link.symlink_to(str(config.data.root))
+    same: list[dict[str, Any]] = [
+        {},
+        {"root": str(link)},
+        {"root": f"{config.data.root}/"},
+        {"version": "v1.0-world"},
+        {"split": "all"},
+    ]
+    for changes in same:
+        own = replace(config, data=replace(config.data, **changes))
+        with pytest.raises(ValueError, match="that the run was not trained on, got 1 of 1 that it was"):
+            evaluate_rendering(own, run_of(config), max_frames=1, all_returns=True)
+    make_world(tmp_path / "other", replace(WORLD, seed=1, keyframes=1), workers=1)
+    other = replace(config, data=replace(config.data, root=str(tmp_path / "other")))
+    held_out = evaluate_rendering(other, run_of(config))
+    every = evaluate_rendering(other, run_of(config), all_returns=True)
+    assert every["all_returns"] and held_out["frames_trained_on"] == every["frames_trained_on"] == 0
+    assert every["depth_rays"] > 5 * held_out["depth_rays"]
+
+
+def test_frames_of_a_run_whose_data_have_moved(config: PretrainConfig, tmp_path: Path) -> None:
+    run = RunFolder(tmp_path / "run")
+    moved = replace(config, data=replace(config.data, root=str(tmp_path / "gone")))
+    run.start(yaml.safe_dump(plain(moved)))
+    assert len(trained_tokens(run, config.data)) == 2
+    assert trained_tokens(run, replace(config.data, dataset="folder")) == set()
 
 
 def test_all_returns_are_those_that_are_not_visible(config: PretrainConfig) -> None:
