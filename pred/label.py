@@ -154,8 +154,7 @@ def _label(config: LabelConfig, segmenter: Segmenter, source: FrameSource) -> St
 
     def read(index: int) -> tuple[Frame, list[Task], Path | None]:
         frame = source.load(index)
-        name = re.sub(r"[^\w.-]+", "-", frame.token)
-        preview = folder / PREVIEWS / f"{name}.png" if index in shown else None
+        preview = folder / PREVIEWS / f"{frame.token}.png" if index in shown else None
         return frame, list(_tasks(frame, config)), None if preview is None or preview.is_file() else preview
 
     statistics = Statistics()
@@ -173,7 +172,7 @@ def _label(config: LabelConfig, segmenter: Segmenter, source: FrameSource) -> St
                 statistics.add(labels, task.path.stat().st_size)
                 found.append(labels)
             if preview is not None:
-                preview.parent.mkdir(exist_ok=True)
+                preview.parent.mkdir(parents=True, exist_ok=True)
                 remove_leftovers(preview)
                 picture = _preview(frame.token, tasks, logits, found)
                 with atomic_write(preview) as file:

@@ -117,7 +117,8 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 @contextmanager
 def one_writer(folder: Path) -> Iterator[None]:
-    """Make a folder if need be and hold it for this process. The lock leaves no file and ends with the process.
+    """Make a folder if need be and hold it for this process. The lock leaves no file and ends with the process; files
+    in the folder that a killed one left half-written are removed.
 
     Raises:
         RunFolderError: it is a file, or another process holds it.
@@ -131,6 +132,8 @@ def one_writer(folder: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise RunFolderError(f"{folder}: must have one writer, got another process") from None
+        for leftover in folder.glob(f".*{TEMPORARY_SUFFIX}"):
+            leftover.unlink()
         yield
     finally:
         os.close(descriptor)

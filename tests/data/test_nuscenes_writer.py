@@ -90,18 +90,29 @@ def tree(root: Path) -> dict[str, str]:
     return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def kill_at_random(command: list[str], begun: Path, times: int, seed: int) -> None:
-    """Start a command so many times and SIGKILL its processes, up to 1.5 s after the folder ``begun`` is there."""
+def kill_at_random(command: list[str], out: Path, times: int, seed: int) -> None:
+    """Start a command so many times and SIGKILL its processes, up to 0.5 s after it has written data to ``out``.
+
+    At least one kill must come before its end.
+    """
     rng = random.Random(seed)
+    killed = 0
     for _ in range(times):
+        before = num_files(out)
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
         deadline = time.monotonic() + 60
-        while not begun.is_dir() and process.poll() is None and time.monotonic() < deadline:
+        while num_files(out) == before and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.01)
-        time.sleep(rng.uniform(0, 1.5))
+        time.sleep(rng.uniform(0, 0.5))
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+        killed += process.wait() == -signal.SIGKILL
+    assert killed > 0
+
+
+def num_files(folder: Path) -> int:
+    """Files of data, at any depth."""
+    return sum(1 for path in folder.rglob("*.*") if path.suffix in (".bin", ".jpg", ".png"))
 
 
 # Files

@@ -189,7 +189,7 @@ def test_killed_and_continued_with_two_workers(root: Path, tmp_path: Path) -> No
     """SIGKILL at random moments; the files are those of one process that ran to its end."""
     out = tmp_path / "world"
     command = [sys.executable, "-m", "pred", "world", "make", str(out), *COMMAND, "--exact-labels", "--workers", "2"]
-    kill_at_random(command, begun=out / "data", times=3, seed=5)
+    kill_at_random(command, out=out, times=3, seed=5)
     settings = WorldSettings(2, SEED, KEYFRAMES, 0.05, layout="once", exact_labels=True)
     make_world(out, settings, workers=2)
     assert made_files(out) == made_files(root)

@@ -148,6 +148,6 @@ def test_killed_and_continued_with_two_workers(root: Path, tmp_path: Path, seed:
     """SIGKILL at random moments; the files are those of one process that ran to its end."""
     out = tmp_path / "world"
     command = [sys.executable, "-m", "pred", "world", "make", str(out), *COMMAND, "--workers", "2"]
-    kill_at_random(command, begun=out / "sweeps", times=2, seed=seed)
+    kill_at_random(command, out=out, times=2, seed=seed)
     assert subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode == 0
     assert tree(out) == tree(root)
