@@ -140,8 +140,8 @@ class DataConfig:
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"data.{name} must be in [0, 1), got {getattr(self, name)}")
         x_min, y_min, x_max, y_max = self.own_car
-        if not (x_min <= x_max and y_min <= y_max):
-            raise ValueError(f"data.ego_box must be (x_min, y_min, x_max, y_max), got {self.ego_box}")
+        if not (x_min <= x_max and y_min <= y_max and all(map(math.isfinite, self.own_car))):
+            raise ValueError(f"data.ego_box must be finite (x_min, y_min, x_max, y_max), got {self.ego_box}")
 
     @property
     def own_car(self) -> EgoBox:

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
-from PIL import Image
 
 from pred.data import soft_labels
 from pred.data.frame import NUM_CLASSES, FrameError, decode_image, open_image
@@ -29,6 +28,7 @@ PROBABILITIES_KEY = "probabilities"
 SOFT_KEYS = (soft_labels.SHAPE, soft_labels.STEPS, soft_labels.CODES)
 LABEL_SUFFIXES = (".png", ".npy", ".npz")
 MAX_PROBABILITY_SUM = 1.01  # room for float16 rounding
+MAX_SCALE = 4  # of a label map against its image: damage must not claim gigabytes
 
 CheckHeader = Callable[[tuple[int, ...], np.dtype[Any]], None]
 """Raises for the shape and type of a label that cannot be used, before anything is allocated for it."""
@@ -133,9 +133,12 @@ class PseudoLabel:
         map_height, map_width = shape
         if map_height < 1 or map_width < 1:
             raise FrameError(self.name, f"label must have at least 1 x 1 cells, got {list(shape)}")
-        max_pixels = Image.MAX_IMAGE_PIXELS
-        if max_pixels is not None and map_height * map_width > max_pixels:
-            raise FrameError(self.name, f"label must have at most {max_pixels} pixels, got {list(shape)}")
+        if map_height * map_width > MAX_SCALE**2 * self.height * self.width:
+            raise FrameError(
+                self.name,
+                f"label must have at most {MAX_SCALE} times the width and height of its {self.width} x {self.height} "
+                f"image, got {map_width} x {map_height}",
+            )
         # One label cell of tolerance: 1600 x 900 at 1/8 is 200 x 112.5.
         if abs(map_width * self.height / self.width - map_height) > 1.0:
             raise FrameError(

@@ -682,7 +682,8 @@ def test_evaluation_batch_with_nothing_held_out() -> None:
             r"data\.depth_filter must be \(absolute m, relative\), got \(0\.5, -0\.1\)",
         ),
         ({"workers": -1}, r"data\.workers must be at least 0, got -1"),
-        ({"ego_box": (1.0, 0.0, -1.0, 0.0)}, r"data\.ego_box must be \(x_min"),
+        ({"ego_box": (1.0, 0.0, -1.0, 0.0)}, r"data\.ego_box must be finite \(x_min"),
+        ({"ego_box": (0.0, 0.0, float("inf"), 1.0)}, r"data\.ego_box must be finite \(x_min"),
     ],
 )
 def test_wrong_settings(changes: dict[str, Any], text: str) -> None:
