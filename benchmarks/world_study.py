@@ -16,13 +16,13 @@ import json
 import statistics
 import subprocess
 import sys
-from argparse import ArgumentParser
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.measure import machine_record
-from pred.run_folder import claim_settings, write_json
+from pred.run_folder import claim_settings, one_writer, write_json
 
 EVALUATED_FRAMES = 16
 """Four of each unseen scene, for the rendering: each has some 60,000 rays."""
@@ -148,11 +148,17 @@ def main(arguments: Sequence[str]) -> int:
     options, pretrain_options = parser.parse_known_args(arguments)
     wanted = {
         "root": str(options.root.resolve()),
+        "world": json.loads((options.root / "world.json").read_text()),
         "pretrain_options": pretrain_options,
         "variants": VARIANTS,
         "evaluated_frames": EVALUATED_FRAMES,
     }
-    claim_settings(options.out / "settings.json", wanted)
+    with one_writer(options.out):
+        claim_settings(options.out / "settings.json", wanted)
+        return _study(options, pretrain_options, arguments)
+
+
+def _study(options: Namespace, pretrain_options: Sequence[str], arguments: Sequence[str]) -> int:
     runs: dict[str, list[dict[str, Any]]] = {variant: [] for variant in options.variants}
     for seed in options.seeds:
         for variant in options.variants:

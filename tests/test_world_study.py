@@ -44,7 +44,11 @@ def test_runs_and_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
             (run / f"evaluation_{arguments[1]}.json").write_text(json.dumps(found))
 
     monkeypatch.setattr(world_study, "_pred", pred)
-    arguments = ["/world", "--out", str(tmp_path), "--seeds", "0", "1", "--variants", "rendering", "projection"]
+    world = tmp_path / "world"
+    world.mkdir()
+    (world / "world.json").write_text('{"seed": 3}')
+    tmp_path /= "study"
+    arguments = [str(world), "--out", str(tmp_path), "--seeds", "0", "1", "--variants", "rendering", "projection"]
     assert world_study.main([*arguments, "--train.steps=7"]) == 0
     assert [command[0] for command in commands] == ["pretrain", "evaluate", "evaluate"] * 4
     assert "--train.steps=7" in commands[0] and "--loss.semantic_at=return" not in commands[0]
@@ -69,3 +73,6 @@ def test_runs_and_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
     assert commands == [["pretrain", "--resume", str(tmp_path / "rendering-seed0")]]
     with pytest.raises(RunFolderError, match="pretrain_options must be"):
         world_study.main([*arguments, "--train.steps=8"])
+    (world / "world.json").write_text('{"seed": 4}')
+    with pytest.raises(RunFolderError, match=r"world must be \{'seed': 3\} as in settings\.json, got \{'seed': 4\}"):
+        world_study.main([*arguments, "--train.steps=7"])
