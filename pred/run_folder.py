@@ -20,6 +20,7 @@ import io
 import json
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import time
@@ -117,8 +118,8 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 @contextmanager
 def one_writer(folder: Path) -> Iterator[None]:
-    """Make a folder if need be and hold it for this process. The lock leaves no file and ends with the process; files
-    in the folder that a killed one left half-written are removed.
+    """Make a folder if need be and hold it for this process. The lock leaves no file and ends with the process; what
+    a killed one left half-written in the folder is removed.
 
     Raises:
         RunFolderError: it is a file, or another process holds it.
@@ -133,7 +134,10 @@ def one_writer(folder: Path) -> Iterator[None]:
         except BlockingIOError:
             raise RunFolderError(f"{folder}: must have one writer, got another process") from None
         for leftover in folder.glob(f".*{TEMPORARY_SUFFIX}"):
-            leftover.unlink()
+            if leftover.is_dir():
+                shutil.rmtree(leftover)
+            else:
+                leftover.unlink()
         yield
     finally:
         os.close(descriptor)
