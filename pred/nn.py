@@ -57,8 +57,8 @@ class SparseTensor:
         batch_size: B.
 
     Raises:
-        ValueError: shapes that do not fit. TypeError: dtype of the indices. Sites outside the grid and repeated ones are
-            found by the first convolution.
+        ValueError: shapes that do not fit. Sites outside the grid and repeated ones are found by the first convolution.
+        TypeError: dtype of the indices.
     """
 
     features: Tensor
@@ -211,7 +211,13 @@ class _Weighted(_Kernel):
             raise ValueError(
                 f"{_name(self)}: features must have in_channels={self.in_channels} columns, got {list(features.shape)}"
             )
-        return sparse_conv(features, self.weight, out_to_in, in_to_out, self.bias)
+        device = features.device.type
+        if not torch.is_autocast_enabled(device):
+            return sparse_conv(features, self.weight, out_to_in, in_to_out, self.bias)
+        dtype = torch.get_autocast_dtype(device)  # as torch's own convolutions
+        bias = None if self.bias is None else self.bias.to(dtype)
+        with torch.autocast(device, enabled=False):
+            return sparse_conv(features.to(dtype), self.weight.to(dtype), out_to_in, in_to_out, bias)
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Convolves; the outputs are the active sites of the rulebook."""
@@ -310,7 +316,9 @@ class SparseInverseConv3d(_Weighted):
         kept = x.rulebooks.get(self.indice_key)
         if kept is None:
             known = ", ".join(map(repr, x.rulebooks)) or "none"
-            raise ValueError(f"{_name(self)}: indice_key must be that of a layer before, got {self.indice_key!r} ({known})")
+            raise ValueError(
+                f"{_name(self)}: indice_key must be that of a layer before, got {self.indice_key!r} ({known})"
+            )
         _require_same(self, "kernel_size", self.kernel_size, kept.kernel[0])
         if not _same_sites(x.indices, kept.rulebook.out_indices):
             raise ValueError(
@@ -366,4 +374,6 @@ def _same_sites(a: Tensor, b: Tensor) -> bool:
 
 def _require_same(module: _Kernel, what: str, now: object, before: object) -> None:
     if now != before:
-        raise ValueError(f"{_name(module)}: indice_key {module.indice_key!r} must mean one {what}, got {now} after {before}")
+        raise ValueError(
+            f"{_name(module)}: indice_key {module.indice_key!r} must mean one {what}, got {now} after {before}"
+        )

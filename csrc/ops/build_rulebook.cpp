@@ -123,16 +123,15 @@ std::vector<int64_t> output_keys(const RulebookArgs& a, const RulebookKernels& k
     num_keys *= a.out_shape[axis];
   }
   const auto fed = allocate_array<int64_t>(a.num_sites * most);
-  parallel(a.num_sites, kGrain,
-           [&](int64_t begin, int64_t end) { k.outputs(a, most, fed.get(), begin, end); });
-  const auto sorted = sort_rows<uint64_t>(a.num_sites * most, 0, bits_for(num_keys),
-                                          [&](uint64_t* items, int64_t begin, int64_t end) {
-                                            int64_t count = 0;
-                                            for (int64_t i = begin; i < end; ++i) {
-                                              if (fed[i] >= 0) items[count++] = uint64_t(fed[i]);
-                                            }
-                                            return count;
-                                          });
+  parallel(a.num_sites, kGrain, [&](int64_t begin, int64_t end) { k.outputs(a, most, fed.get(), begin, end); });
+  const auto sorted =
+      sort_rows<uint64_t>(a.num_sites * most, 0, bits_for(num_keys), [&](uint64_t* items, int64_t begin, int64_t end) {
+        int64_t count = 0;
+        for (int64_t i = begin; i < end; ++i) {
+          if (fed[i] >= 0) items[count++] = uint64_t(fed[i]);
+        }
+        return count;
+      });
   std::vector<int64_t> keys;
   for (int64_t i = 0; i < sorted.count; ++i) {
     if (i == 0 || sorted.items[i] != sorted.items[i - 1]) keys.push_back(int64_t(sorted.items[i]));
@@ -166,9 +165,8 @@ std::tuple<Tensor, Tensor, Tensor> build_rulebook(const Tensor& indices_in, int6
   if (submanifold) {
     Tensor out_to_in = new_table(a.num_sites);
     int32_t* out_data = out_to_in.mutable_data_ptr<int32_t>();
-    parallel(a.num_sites, kGrain, [&](int64_t begin, int64_t end) {
-      k.submanifold(a, inputs.table, out_data, in_data, begin, end);
-    });
+    parallel(a.num_sites, kGrain,
+             [&](int64_t begin, int64_t end) { k.submanifold(a, inputs.table, out_data, in_data, begin, end); });
     return {torch::stable::clone(indices), out_to_in, in_to_out};
   }
 
@@ -190,9 +188,8 @@ std::tuple<Tensor, Tensor, Tensor> build_rulebook(const Tensor& indices_in, int6
   }
   Tensor out_to_in = new_table(num_out);
   int32_t* out_data = out_to_in.mutable_data_ptr<int32_t>();
-  parallel(a.num_sites, kGrain, [&](int64_t begin, int64_t end) {
-    k.strided(a, outputs.table, out_data, in_data, begin, end);
-  });
+  parallel(a.num_sites, kGrain,
+           [&](int64_t begin, int64_t end) { k.strided(a, outputs.table, out_data, in_data, begin, end); });
   return {out_indices, out_to_in, in_to_out};
 }
 

@@ -45,8 +45,8 @@ template <typename S>
 void product(const Problem& in, const Tensor& table, const S* source, bool transposed, const S* bias, S* out) {
   using T = Compute<S>;
   const SparseConvKernels<S>& k = sparse_conv_kernels<S>();
-  SparseConvArgs<S> a{table.const_data_ptr<int32_t>(), in.taps, in.inputs, in.outputs, source, nullptr, 0, bias,
-                      nullptr};
+  SparseConvArgs<S> a{
+      table.const_data_ptr<int32_t>(), in.taps, in.inputs, in.outputs, source, nullptr, 0, bias, nullptr};
   if (transposed) std::swap(a.inputs, a.outputs);
   a.packed_size = k.packed_size(a.inputs, a.outputs);
   const auto packed = allocate_array<char>(in.taps * a.packed_size * int64_t(sizeof(Factor<S>)) + Arena::kAlignment);
@@ -79,8 +79,15 @@ template <typename S>
 void weight_gradient(const Problem& in, const S* grad, S* out) {
   using T = Compute<S>;
   const SparseConvKernels<S>& k = sparse_conv_kernels<S>();
-  const SparseConvArgs<S> a{in.out_to_in.const_data_ptr<int32_t>(), in.taps, in.inputs, in.outputs,
-                            storage<S>(in.features), nullptr, 0, nullptr, grad};
+  const SparseConvArgs<S> a{in.out_to_in.const_data_ptr<int32_t>(),
+                            in.taps,
+                            in.inputs,
+                            in.outputs,
+                            storage<S>(in.features),
+                            nullptr,
+                            0,
+                            nullptr,
+                            grad};
   const int64_t columns = k.columns(in.inputs), size = in.outputs * columns;
   const Blocks blocks = weight_blocks(in);
   const int64_t count = blocks.count();

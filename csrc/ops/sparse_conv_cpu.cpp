@@ -3,11 +3,10 @@
 //
 // A tile of output rows goes through the taps one by one: the rows that a tap reads are gathered side by side,
 // multiplied, and added to the tile's sums, which stay in cache. One iteration owns its rows, or a tap's sums.
-#include "ops/sparse_conv.h"
-
 #include "common/allocate.h"
 #include "common/tile.h"
 #include "math/product.h"
+#include "ops/sparse_conv.h"
 
 namespace pred::PRED_ISA {
 namespace {
@@ -133,8 +132,8 @@ static bool is_valid(const int32_t* table, int64_t rows, int64_t begin, int64_t 
 
 template <typename S>
 constexpr SparseConvKernels<S> table() {
-  return {factors_size<S>,        pack_factors<S>,    panel_columns<Compute<S>>, scratch_bytes<S>,
-          product_along_table<S>, weight_gradient<S>, is_valid};
+  return {factors_size<S>,    pack_factors<S>, panel_columns<Compute<S>>, scratch_bytes<S>, product_along_table<S>,
+          weight_gradient<S>, is_valid};
 }
 
 }  // namespace

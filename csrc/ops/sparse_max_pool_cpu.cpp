@@ -2,9 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // One iteration owns one row of the result.
-#include "ops/sparse_max_pool.h"
-
 #include "ops/segment_reduce.h"
+#include "ops/sparse_max_pool.h"
 
 namespace pred::PRED_ISA {
 namespace {

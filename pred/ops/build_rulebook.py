@@ -42,7 +42,7 @@ def build_rulebook(
     Per axis output o reads the inputs ``o stride - padding + k dilation`` for k in [0, kernel_size), as in
     ``torch.nn.functional.conv3d``. Active outputs are the sites that read at least one active input; of a submanifold
     convolution they are the inputs themselves. Taps are numbered (z, y, x), x fastest: K = kz ky kx.
-    The tables of a convolution, exchanged, are those of the transposed one back to its inputs (``SparseInverseConv3d``).
+    The tables of a convolution, exchanged, are those of the transposed one back to its inputs.
 
     Args:
         indices: ``[M, 4]`` int32 or int64 (b, z, y, x) of the active sites, distinct, in any order.
@@ -94,7 +94,9 @@ def output_shape(
     dilation: int | Sequence[int] = 1,
 ) -> tuple[int, int, int]:
     """Cells (z, y, x) of a convolution's output, as of ``conv3d``."""
-    kernel, step, pad, spread = (_triple("output_shape", "argument", x) for x in (kernel_size, stride, padding, dilation))
+    kernel, step, pad, spread = (
+        _triple("output_shape", "argument", x) for x in (kernel_size, stride, padding, dilation)
+    )
     z, y, x = (
         (spatial_shape[axis] + 2 * pad[axis] - spread[axis] * (kernel[axis] - 1) - 1) // step[axis] + 1
         for axis in range(3)
@@ -137,7 +139,9 @@ def _reference(
         out_indices = torch.stack(columns, dim=1).to(indices.dtype)
     num_out = out_indices.shape[0]
     if num_out == 0:
-        return Rulebook(out_indices, tap.new_empty(0, tap.shape[0]).int(), tap.new_full((num_sites, tap.shape[0]), -1).int())
+        return Rulebook(
+            out_indices, tap.new_empty(0, tap.shape[0]).int(), tap.new_full((num_sites, tap.shape[0]), -1).int()
+        )
     position = torch.searchsorted(keys, key).clamp_max(num_out - 1)
     valid &= keys[position] == key
     in_to_out = torch.where(valid, row_of[position], -1)
@@ -209,12 +213,9 @@ def _arguments(
 
 def _triple(op: str, name: str, value: int | Sequence[int], least: int = 0) -> Triple:
     """A number for each of z, y and x."""
-    if isinstance(value, Sequence) or (hasattr(value, "__len__") and not isinstance(value, Tensor)):
-        if len(value) != 3:
-            raise ValueError(f"{op}: {name} must hold 3 numbers (z, y, x), got {len(value)}")
-        numbers = tuple(value)
-    else:
-        numbers = (value,) * 3
+    numbers: tuple[int, ...] = (value,) * 3 if isinstance(value, int) or not hasattr(value, "__len__") else tuple(value)
+    if len(numbers) != 3:
+        raise ValueError(f"{op}: {name} must hold 3 numbers (z, y, x), got {len(numbers)}")
     for number in numbers:
         check_count(op, name, number, least)
         if not torch.compiler.is_compiling() and number > _MAX_EXTENT:

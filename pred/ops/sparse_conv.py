@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pred import _native
-from pred.ops._check import check_like, check_shape, check_tensors
+from pred.ops._check import check_like, check_shape, check_tensors, widen
 from pred.ops._rulebook import check_tables, padded
 
 
@@ -33,8 +33,6 @@ def sparse_conv(
             second: tables that do not belong together give a gradient of another function.
         bias: ``[O]`` or None.
 
-    Under autocast features, weight and bias are cast to its dtype, as of torch's convolutions.
-
     Returns:
         ``[M', O]`` in the dtype of the features, rounded once. A NaN stays in the outputs that read it.
 
@@ -50,8 +48,7 @@ def sparse_conv(
     features, weight, bias = _arguments(features, weight, out_to_in, in_to_out, bias)
     if not _native.use_native(op, features):
         return _reference(features, weight, out_to_in, bias)
-    with torch.autocast(features.device.type, enabled=False):
-        out: Tensor = _native.checked(torch.ops.pred.sparse_conv, features, weight, bias, out_to_in, in_to_out)
+    out: Tensor = _native.checked(torch.ops.pred.sparse_conv, features, weight, bias, out_to_in, in_to_out)
     return out
 
 
@@ -86,14 +83,7 @@ def _arguments(
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     op = "sparse_conv"
     check_tensors(op, features=features, weight=weight, **({} if bias is None else {"bias": bias}))
-    device = features.device.type
-    if torch.is_autocast_enabled(device):
-        dtype = torch.get_autocast_dtype(device)
-        features, weight, bias = (
-            x if x is None or x.dtype == torch.float64 or not x.is_floating_point() else x.to(dtype)
-            for x in (features, weight, bias)
-        )
-        assert features is not None and weight is not None
+    features, weight, bias = widen(features), widen(weight), None if bias is None else widen(bias)
     check_tables(op, features, out_to_in, in_to_out)
     taps, channels = out_to_in.shape[1], features.shape[1]
     if weight.dim() == 5:
@@ -107,9 +97,7 @@ def _arguments(
     return features, weight, bias
 
 
-def _fake(
-    features: Tensor, weight: Tensor, bias: Tensor | None, out_to_in: Tensor, in_to_out: Tensor
-) -> Tensor:
+def _fake(features: Tensor, weight: Tensor, bias: Tensor | None, out_to_in: Tensor, in_to_out: Tensor) -> Tensor:
     return features.new_empty(out_to_in.shape[0], weight.shape[0])
 
 
@@ -153,9 +141,7 @@ def _save_backward(ctx: Any, inputs: Any, output: Any) -> None:
     ctx.save_for_backward(grad, features, weight, out_to_in, in_to_out)
 
 
-def _double_backward(
-    ctx: Any, grad_features: Tensor | None, grad_weight: Tensor | None
-) -> tuple[Tensor | None, ...]:
+def _double_backward(ctx: Any, grad_features: Tensor | None, grad_weight: Tensor | None) -> tuple[Tensor | None, ...]:
     """The backward pass is bilinear: in ``grad`` and the weight for the features', in ``grad`` and the features for the
     weight's. Its derivatives are the convolution and its gradients again."""
     grad, features, weight, out_to_in, in_to_out = ctx.saved_tensors
