@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -142,7 +142,7 @@ def _reference(
         return Rulebook(
             out_indices, tap.new_empty(0, tap.shape[0]).int(), tap.new_full((num_sites, tap.shape[0]), -1).int()
         )
-    position = torch.searchsorted(keys, key).clamp_max(num_out - 1)
+    position = torch.searchsorted(keys, key.contiguous()).clamp_max(num_out - 1)
     valid &= keys[position] == key
     in_to_out = torch.where(valid, row_of[position], -1)
     out_to_in = torch.full((num_out, tap.shape[0]), -1, device=device)
@@ -211,9 +211,9 @@ def _arguments(
     return shape, kernel, step, pad, spread
 
 
-def _triple(op: str, name: str, value: int | Sequence[int], least: int = 0) -> Triple:
+def _triple(op: str, name: str, value: Any, least: int = 0) -> Triple:
     """A number for each of z, y and x."""
-    numbers: tuple[int, ...] = (value,) * 3 if isinstance(value, int) or not hasattr(value, "__len__") else tuple(value)
+    numbers = tuple(value) if hasattr(value, "__len__") else (value,) * 3
     if len(numbers) != 3:
         raise ValueError(f"{op}: {name} must hold 3 numbers (z, y, x), got {len(numbers)}")
     for number in numbers:

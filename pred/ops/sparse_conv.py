@@ -74,7 +74,8 @@ def _reference(features: Tensor, weight: Tensor, out_to_in: Tensor, bias: Tensor
             out = out + bias.to(wide)
         for tap in range(weight.shape[1]):
             source = out_to_in[:, tap].long()
-            out = out + rows[torch.where(source < 0, features.shape[0], source)] @ weight[:, tap].T
+            product = rows[torch.where(source < 0, features.shape[0], source)] @ weight[:, tap].T
+            out = out + torch.where(source[:, None] < 0, 0.0, product)  # not 0 x inf
     return out.to(dtype)
 
 
