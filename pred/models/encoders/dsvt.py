@@ -21,7 +21,6 @@ positions in the windows of shift i, whatever windows the block attends in (DSVT
 M pillars, C feature channels, H heads, S largest set, B frames.
 """
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -193,7 +192,7 @@ class DSVT(nn.Module):
         ]
         sets = [[PaddedSets.of(partition, along) for along in (0, 1)] for partition in partitions]
         cells = [partition.cell for partition in partitions]
-        embeddings = self.input_layer.posembed_layers[0]  # type: ignore[union-attr,index]
+        embeddings = self.input_layer.posembed_layers[0]  # type: ignore[index]
         for index, (block, norm) in enumerate(zip(self.stage_0, self.residual_norm_stage_0, strict=True)):
             positions = [embed(cell) for embed, cell in zip(embeddings[index], cells, strict=True)]
             features = norm(block(features, positions, sets[index % 2]) + features)
@@ -304,7 +303,8 @@ class PositionEmbedding(nn.Module):
     def forward(self, cell: Tensor) -> Tensor:  # [M] int64 to [M, C]
         """Embedding of each pillar, from its cell in the window."""
         size_x, size_y = self.window
-        first, norm, _, last = self.position_embedding_head
+        first, norm, last = (self.position_embedding_head[index] for index in (0, 1, 3))
+        assert isinstance(first, nn.Linear) and isinstance(norm, nn.BatchNorm1d)
         with torch.autocast(cell.device.type, enabled=False):
             cells = torch.arange(size_x * size_y, device=cell.device)
             position = torch.stack([cells % size_x - size_x / 2, cells // size_x - size_y / 2], dim=1)
