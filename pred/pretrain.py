@@ -52,6 +52,9 @@ DIGEST_FRAMES = 1000
 RECALIBRATION_BATCHES = 16
 """Batches whose average makes the final batch normalisation statistics; 4 and 64 were found to do as well."""
 
+ATTENTION_IN_PROJ = ("in_proj_weight", "in_proj_bias")
+"""Parameters of attention that project to queries, keys and values, as `torch.nn.MultiheadAttention` names them."""
+
 
 @dataclass
 class TrainConfig:
@@ -76,6 +79,9 @@ class TrainConfig:
     """AdamW's beta1: the second value at the ends of the schedule, the first where the learning rate peaks."""
     beta2: float = 0.99
     """AdamW's beta2."""
+    attention_in_proj: Literal["train", "freeze"] = "train"
+    """freeze: query, key and value projections of attention stay at their initial values, as OpenPCDet's and DSVT's
+    adam_onecycle leaves them (docs/optimiser.md)."""
     grad_clip: float = 35.0
     """Largest norm of the gradient of all parameters together."""
     seed: int = 0
@@ -314,9 +320,21 @@ def build_model(config: PretrainConfig) -> Pretrainer:
 
 
 def build_optimizer(model: torch.nn.Module, train: TrainConfig) -> AdamW:
-    """AdamW over all parameters."""
+    """AdamW over all parameters, or over all but the frozen: ``attention_in_proj="freeze"`` takes the gradient from the
+    parameters in `ATTENTION_IN_PROJ`, so they are neither moved nor decayed, nor part of the clipped norm.
+
+    Raises:
+        ValueError: there is nothing to freeze.
+    """
+    if train.attention_in_proj == "freeze":
+        frozen = [parameter for name, parameter in model.named_parameters() if name.split(".")[-1] in ATTENTION_IN_PROJ]
+        if not frozen:
+            raise ValueError("train.attention_in_proj must be train for a model without attention, got freeze")
+        for parameter in frozen:
+            parameter.requires_grad_(False)
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     betas = (train.momentum_range[1], train.beta2)
-    return AdamW(model.parameters(), lr=train.lr, betas=betas, weight_decay=train.weight_decay, fused=True)
+    return AdamW(parameters, lr=train.lr, betas=betas, weight_decay=train.weight_decay, fused=True)
 
 
 def load_model(config: PretrainConfig, folder: RunFolder, checkpoint: Path | None = None) -> tuple[Pretrainer, Path]:
