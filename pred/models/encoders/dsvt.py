@@ -22,11 +22,14 @@ M pillars, C feature channels, H heads, S largest set, B frames.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+LENGTH_STEP = 8
+"""Sets whose lengths round up to the same multiple of this attend together."""
 
 
 @dataclass
@@ -190,7 +193,7 @@ class DSVT(nn.Module):
             set_partition(coords, self.grid_size, window, shift, self.config.set_size)
             for window, shift in self.config.windows
         ]
-        sets = [[PaddedSets.of(partition, along) for along in (0, 1)] for partition in partitions]
+        sets = [pad_sets(partition) for partition in partitions]
         cells = [partition.cell for partition in partitions]
         embeddings = self.input_layer.posembed_layers[0]  # type: ignore[index]
         for index, (block, norm) in enumerate(zip(self.stage_0, self.residual_norm_stage_0, strict=True)):
@@ -200,27 +203,74 @@ class DSVT(nn.Module):
 
 
 class PaddedSets(NamedTuple):
-    """The sets of one order as a table, for attention over all of them at once."""
+    """The sets of one order in tables of like length, for attention over all sets of a table at once.
+
+    A table's length is that of its sets rounded up to a multiple of `LENGTH_STEP`; shorter sets repeat their first
+    pillar, masked as a key. T slots in all tables together.
+    """
 
     pillar: Tensor
-    """`[sets, L]` int64, L the longest set; shorter ones are padded with their last pillar."""
-    valid: Tensor
-    """`[sets, L]` bool: false where padded."""
+    """`[T]` int64: the pillar in each slot, table after table, set after set."""
     slot: Tensor
-    """`[M]` int64: where each pillar stands in the flattened table."""
+    """`[M]` int64: the slot of each pillar."""
+    valid: Tensor
+    """`[T]` bool: false in the slots that repeat."""
+    tables: list[tuple[int, int]]
+    """Sets and length of each table."""
+
+    def attend(self, projected: Tensor, num_heads: int) -> Tensor:
+        """Scaled dot-product attention in every set: query, key and value of each pillar `[M, 3 C]` to `[M, C]`."""
+        slots = _Rearrange.apply(projected, self.pillar, self.slot, None)
+        sizes = [sets * length for sets, length in self.tables]
+        attended = []
+        for rows, valid, shape in zip(slots.split(sizes), self.valid.split(sizes), self.tables, strict=True):
+            # each [sets, H, length, C / H]
+            query, key, value = rows.view(*shape, 3, num_heads, -1).permute(2, 0, 3, 1, 4)
+            result = F.scaled_dot_product_attention(query, key, value, valid.view(shape)[:, None, None])
+            attended.append(result.transpose(1, 2).flatten(2).flatten(0, 1))
+        return _Rearrange.apply(torch.cat(attended), self.slot, self.pillar, self.valid)
+
+
+def pad_sets(partition: SetPartition) -> tuple[PaddedSets, PaddedSets]:
+    """The tables of a partition's two orders, which have sets of the same lengths."""
+    offsets = partition.offsets
+    steps = (offsets.diff() + LENGTH_STEP - 1) // LENGTH_STEP
+    by_length = torch.argsort(steps, stable=True)
+    of_length = torch.bincount(steps).tolist()
+    tables = [(sets, step * LENGTH_STEP) for step, sets in enumerate(of_length) if sets]
+    start, length = offsets[:-1][by_length], offsets.diff()[by_length]
+    padded = steps[by_length] * LENGTH_STEP
+    set_of_slot = torch.repeat_interleave(torch.arange(len(padded), device=offsets.device), padded)
+    position = torch.arange(len(set_of_slot), device=offsets.device) - (padded.cumsum(0) - padded)[set_of_slot]
+    valid = position < length[set_of_slot]
+    place = start[set_of_slot] + position * valid
+    slot_of_place = torch.empty_like(partition.cell)
+    slot_of_place[place[valid]] = valid.nonzero()[:, 0]
+    found = []
+    for order in partition.order:
+        slot = torch.empty_like(order)
+        slot[order] = slot_of_place
+        found.append(PaddedSets(order[place], slot, valid, tables))
+    return found[0], found[1]
+
+
+class _Rearrange(torch.autograd.Function):
+    """``values[index]``, whose gradient is ``grad[inverse]``, and zero in rows that are not `taken`.
+
+    Right where each row of values reaches the gradient through one of the rows that show it: the repeats in padded sets
+    have no effect. Both ways are gathers, which is fast and repeatable.
+    """
 
     @staticmethod
-    def of(partition: SetPartition, along: int) -> "PaddedSets":
-        """Of order `along`, 0 or 1."""
-        order, offsets = partition.order[along], partition.offsets
-        length = offsets.diff()
-        longest = int(length.max())
-        position = torch.arange(longest, device=order.device)
-        valid = position < length[:, None]
-        pillar = order[offsets[:-1, None] + torch.minimum(position, length[:, None] - 1)]
-        slot = torch.empty_like(order)
-        slot[order] = valid.flatten().nonzero()[:, 0]
-        return PaddedSets(pillar, valid, slot)
+    def forward(ctx: Any, values: Tensor, index: Tensor, inverse: Tensor, taken: Tensor | None) -> Tensor:
+        ctx.save_for_backward(inverse, taken)
+        return values.index_select(0, index)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+        inverse, taken = ctx.saved_tensors
+        grad = grad.index_select(0, inverse)
+        return (grad if taken is None else grad.masked_fill(~taken[:, None], 0)), None, None, None
 
 
 class Block(nn.Module):
@@ -230,7 +280,7 @@ class Block(nn.Module):
         super().__init__()
         self.encoder_list = nn.ModuleList(Layer(config) for _ in range(2))
 
-    def forward(self, features: Tensor, positions: list[Tensor], sets: list[PaddedSets]) -> Tensor:
+    def forward(self, features: Tensor, positions: list[Tensor], sets: tuple[PaddedSets, PaddedSets]) -> Tensor:
         for layer, position, of_layer in zip(self.encoder_list, positions, sets, strict=True):
             features = layer(features, position, of_layer)
         return features
@@ -283,11 +333,7 @@ class SelfAttention(nn.Module):
         weight, bias = self.in_proj_weight, self.in_proj_bias
         query_key = F.linear(features + position, weight[: 2 * channels], bias[: 2 * channels])
         value = F.linear(features, weight[2 * channels :], bias[2 * channels :])
-        # [sets, L, 3, H, C / H] to three of [sets, H, L, C / H]
-        padded = torch.cat([query_key, value], dim=1)[sets.pillar].unflatten(2, (3, self.num_heads, -1))
-        query, key, value = padded.permute(2, 0, 3, 1, 4)
-        attended = F.scaled_dot_product_attention(query, key, value, sets.valid[:, None, None, :])
-        return self.out_proj(attended.transpose(1, 2).flatten(2).flatten(0, 1)[sets.slot])
+        return self.out_proj(sets.attend(torch.cat([query_key, value], dim=1), self.num_heads))
 
 
 class PositionEmbedding(nn.Module):
