@@ -1,14 +1,16 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""Shared fixtures. Tests of real data read PRED_TEST_DATA, the folder that holds nuscenes_tiny/; the test against the
-official ONCE evaluation reads PRED_TEST_FIXTURES, the folder that holds once_golden.json."""
+"""Shared fixtures. Tests of real data read PRED_TEST_DATA, the folder that holds nuscenes_tiny/; tests against other
+frameworks read PRED_TEST_FIXTURES, the folder that holds once_golden.json (results of the official ONCE evaluation) and
+state_dicts/<model>.txt (names, shapes and types of the tensors of OpenPCDet's and DSVT's detectors)."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -97,3 +99,21 @@ def once_golden() -> dict[str, Any]:
         pytest.skip("PRED_TEST_FIXTURES is not set: no results of the official ONCE evaluation")
     golden: dict[str, Any] = json.loads((Path(folder) / "once_golden.json").read_text())
     return golden
+
+
+@pytest.fixture(scope="session")
+def published_encoder() -> Callable[[str], dict[str, tuple[tuple[int, ...], str]]]:
+    """Shape and type of every tensor of the encoder of one of the published detectors, by name, in their order."""
+    folder = os.environ.get("PRED_TEST_FIXTURES")
+    if not folder:
+        pytest.skip("PRED_TEST_FIXTURES is not set: no state dicts of published detectors")
+
+    def read(model: str) -> dict[str, tuple[tuple[int, ...], str]]:
+        tensors: dict[str, tuple[tuple[int, ...], str]] = {}
+        for line in (Path(folder) / "state_dicts" / f"{model}.txt").read_text().splitlines():
+            if found := re.fullmatch(r"((?:vfe|backbone_3d|backbone_2d)\.\S+) \((.*)\) (\w+)", line):
+                tensors[found[1]] = (tuple(int(size) for size in found[2].split(",") if size.strip()), found[3])
+        assert len(tensors) > 100, model
+        return tensors
+
+    return read

@@ -44,9 +44,26 @@ def check(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         assert error <= 1e-3 * max(float(expected.norm()), 1e-3 * largest), name
 
 
-def test_step_on_a_made_world(native: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    check(["--config=world_pillars", f"--data.root={tiny_world()}", "--data.workers=0"], monkeypatch)
+FAMILIES = {
+    "hard pillars": ["--config=world_pillars", "--encoder.pillars.max_points=20"],
+    "voxels": ["--config=world_voxels"],
+    "plain voxels, before 2D": [
+        "--config=world_voxels", "--encoder.voxels.backbone=plain", "--encoder.voxels.max_points=null",
+        "--encoder.bev=before_2d",
+    ],
+    "dsvt": ["--config=world_dsvt"],
+}  # fmt: skip
 
 
-def test_step_on_the_real_keyframe(native: None, nuscenes_tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    check(["--config=nuscenes_tiny", f"--data.root={nuscenes_tiny}", "--data.workers=0"], monkeypatch)
+@pytest.mark.parametrize("family", ["pillars", *FAMILIES])
+def test_step_on_a_made_world(family: str, native: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = FAMILIES.get(family, ["--config=world_pillars"])
+    check([*options, f"--data.root={tiny_world()}", "--data.workers=0"], monkeypatch)
+
+
+@pytest.mark.parametrize("family", ["pillars", *FAMILIES])
+def test_step_on_the_real_keyframe(
+    family: str, native: None, nuscenes_tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = FAMILIES.get(family, ["--config=nuscenes_tiny"])
+    check([*options, f"--data.root={nuscenes_tiny}", "--data.split=null", "--data.workers=0"], monkeypatch)

@@ -184,10 +184,11 @@ class PointPillarScatter(nn.Module):
         # Pillars are unique, so a copy is enough. The map is stored channels-last, which is also
         # what the convolutions like best.
         num_rows, num_columns = self.grid_size
-        canvas = features.new_zeros(num_frames * num_rows * num_columns, features.shape[1])
+        channels = features.shape[1]
+        canvas = features.new_zeros(num_frames * num_rows * num_columns, channels)
         frame, row, column = coords[:, 0], coords[:, 2], coords[:, 3]
         canvas = canvas.index_copy(0, (frame * num_rows + row) * num_columns + column, features)
-        return canvas.view(num_frames, num_rows, num_columns, -1).permute(0, 3, 1, 2)
+        return canvas.view(num_frames, num_rows, num_columns, channels).permute(0, 3, 1, 2)
 
 
 def cell_centres(
