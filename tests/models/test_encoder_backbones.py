@@ -50,7 +50,7 @@ def random_points(num_points: int, seed: int = 0) -> Tensor:
 
 def assert_equal(actual: Tensor, expected: Tensor) -> None:
     assert actual.shape == expected.shape
-    torch.testing.assert_close(actual, expected, rtol=0, atol=ROUNDING * float(expected.abs().max()))
+    torch.testing.assert_close(actual, expected, rtol=0, atol=ROUNDING * float(expected.detach().abs().max()))
 
 
 # Point features
