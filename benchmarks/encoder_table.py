@@ -52,8 +52,9 @@ BACKENDS = ("native", "reference")
 WINDOW = 20
 """First and last steps whose losses are averaged."""
 COMPARED = 2
-"""First steps whose losses are compared between the backends: of the initial weights, and after an update. Later ones part,
-as of any two runs that differ by rounding (`benchmarks.agreement`): tenfold with each step, to some 1e-3."""
+"""First steps whose losses are compared between the backends: of the initial weights, and after an update. Later ones
+part, as of any two runs that differ by rounding (`benchmarks.agreement`): tenfold with each step, to some 1e-3.
+"""
 
 
 def train(options: Sequence[str], run: Path, backend: str) -> dict[str, Any]:
