@@ -31,7 +31,7 @@ from pred.config import flatten, plain, to_yaml
 from pred.data.batch import Batch, DataConfig, PointRange, TrainingBatches, build_source, make_loader
 from pred.data.frame import NUM_CLASSES, FrameSource
 from pred.losses import LossConfig
-from pred.models.encoders.pillars import PillarEncoderConfig
+from pred.models.encoders import EncoderConfig
 from pred.models.field import FieldConfig
 from pred.models.pretrainer import Pretrainer, PretrainOutput
 from pred.models.renderer import RendererConfig
@@ -87,7 +87,7 @@ class TrainConfig:
     seed: int = 0
     """Of the initial weights and of all sampling."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
-    """bf16-mixed: the convolutions of the encoder's 2D backbone in bfloat16, all else in float32."""
+    """bf16-mixed: the encoder's backbones in bfloat16, all else in float32."""
     deterministic: bool = True
     """Use only algorithms that repeat bit for bit (needed for an exact resume on CUDA)."""
     accelerator: str = "auto"
@@ -130,8 +130,8 @@ class PretrainConfig:
     """Range box (x_min, y_min, z_min, x_max, y_max, z_max), metres, LiDAR frame."""
     data: DataConfig = dataclasses.field(default_factory=DataConfig)
     """What is read, what is hidden from the encoder, and how many rays are drawn."""
-    encoder: PillarEncoderConfig = dataclasses.field(default_factory=PillarEncoderConfig)
-    """Sizes of the pillar encoder."""
+    encoder: EncoderConfig = dataclasses.field(default_factory=EncoderConfig)
+    """Family and sizes of the encoder."""
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     """Sizes of the decoder from BEV features to signed distance and semantics."""
     renderer: RendererConfig = dataclasses.field(default_factory=RendererConfig)
@@ -316,7 +316,14 @@ def build_model(config: PretrainConfig) -> Pretrainer:
     """The network with its initial weights, a function of the configuration and its seed alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed_of(config.train.seed, "initial weights"))
-        return Pretrainer(config.encoder, config.field, config.renderer, config.loss, config.point_range)
+        return Pretrainer(
+            config.encoder,
+            config.field,
+            config.renderer,
+            config.loss,
+            config.point_range,
+            len(config.data.point_channels),
+        )
 
 
 def build_optimizer(model: torch.nn.Module, train: TrainConfig) -> AdamW:
@@ -471,7 +478,7 @@ def export_encoder(path: Path, model: Pretrainer, config: PretrainConfig, step: 
             "encoder_config": plain(encoder),
             "point_range_m": [float(value) for value in config.point_range],
             "voxel_size_m": [float(size) for size in model.encoder.voxel_size],
-            "point_channels": ["x_m", "y_m", "z_m", "intensity", "age_s"],
+            "point_channels": list(config.data.point_channels),
             "coordinates": "LiDAR frame of the data set",
             "sweeps": config.data.sweeps,
             "mask_ratio": config.data.mask_ratio,

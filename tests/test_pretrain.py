@@ -27,8 +27,8 @@ from pred.checkpoint import CheckpointError, list_checkpoints, load_tensors
 from pred.data.batch import DataConfig, TrainingBatches, build_source
 from pred.data.frame import FrameError
 from pred.losses import LossConfig
-from pred.models.encoders.dsvt import DSVT, DSVTConfig
-from pred.models.encoders.pillars import PillarEncoderConfig
+from pred.models.encoders import BEVBackboneConfig, DSVTConfig, EncoderConfig, PillarConfig, VoxelConfig
+from pred.models.encoders.dsvt import DSVT
 from pred.models.field import FieldConfig
 from pred.models.pretrainer import Pretrainer
 from pred.models.renderer import RendererConfig
@@ -570,7 +570,7 @@ def test_batch_norm_statistics_are_those_of_the_final_weights(finished: Path) ->
     batches = TrainingBatches(config.data, config.point_range, config.train.seed, 12)
     # One layer, by hand: the first of the 2D backbone, over all the steps' inputs (fewer than 16).
     inputs: list[Tensor] = []
-    block: Any = network.encoder.backbone_2d.blocks[0]
+    block: Any = network.encoder.get_submodule("backbone_2d.blocks.0")
     convolution, norm = block[1], block[2]
     convolution.register_forward_hook(lambda module, arguments, output: inputs.append(output))
     network.train()
@@ -661,7 +661,8 @@ def test_csv_log_killed_within_the_header(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "config_class",
     [
-        PretrainConfig, DataConfig, PillarEncoderConfig, FieldConfig, RendererConfig, LossConfig, TrainConfig,
+        PretrainConfig, DataConfig, EncoderConfig, PillarConfig, VoxelConfig, DSVTConfig, BEVBackboneConfig,
+        FieldConfig, RendererConfig, LossConfig, TrainConfig,
     ],
 )  # fmt: skip
 def test_config_classes_document_every_field(config_class: type[Any]) -> None:
