@@ -73,6 +73,8 @@ class Case:
     """Of every result, relative to its largest magnitude; 0: equal."""
     outliers: float = 0.0
     """Share of elements that may miss the tolerance, with the reason beside it."""
+    needs_kernel: bool = True
+    """Ours is a kernel of the op's name; without it there is nothing to time."""
     peers: Mapping[str, Callable[[], Variant]] = field(default_factory=dict)
     """Other libraries, by name. The call imports the library, so that a missing one is an ImportError of its own."""
 

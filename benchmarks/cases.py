@@ -51,6 +51,10 @@ class Sizes:
     step_rays: int
     """Semantic rays of the rendering step, and as many depth rays."""
     step_hidden: int
+    dsvt_pillars: tuple[int, ...]
+    """Pillars of a frame, in a grid of `dsvt_cells` rows and columns of `dsvt_m` metres."""
+    dsvt_cells: int
+    dsvt_m: float
 
 
 REAL = Sizes(
@@ -73,6 +77,9 @@ REAL = Sizes(
     features=64,
     step_rays=512,
     step_hidden=256,
+    dsvt_pillars=(4000, 20_000),
+    dsvt_cells=360,
+    dsvt_m=0.3,
 )
 TINY = Sizes(
     bev_channels=8,
@@ -94,6 +101,9 @@ TINY = Sizes(
     features=4,
     step_rays=3,
     step_hidden=16,
+    dsvt_pillars=(40, 200),
+    dsvt_cells=36,
+    dsvt_m=3.0,
 )
 SIZES = {"tiny": TINY, "real": REAL}
 
@@ -207,6 +217,23 @@ def coarse_rays(sizes: Sizes, seed: int = 0) -> CoarseRays:
     alpha = ((before - after) / before).clamp_min(0)
     transmittance = torch.cat([torch.ones_like(t[:, :1]), (1 - alpha).cumprod(dim=1)], dim=1)
     return CoarseRays(t, torch.nn.functional.pad(alpha, (0, 1)) * transmittance)
+
+
+def lidar_pillars(num_pillars: int, cells: int, cell_m: float, seed: int = 0) -> Tensor:  # [M, 4]: b, z, y, x
+    """Pillars of one frame, as dense as a spinning LiDAR sees a plain: with the inverse square of the distance."""
+    generator, half_m = _generator(seed), cells * cell_m / 2
+    draws = 20 * num_pillars
+    range_m = (half_m * math.sqrt(2)) ** torch.rand(draws, generator=generator)
+    azimuth_rad = 2 * math.pi * torch.rand(draws, generator=generator)
+    x, y = (((range_m * part + half_m) / cell_m).long() for part in (azimuth_rad.cos(), azimuth_rad.sin()))
+    inside = (x >= 0) & (x < cells) & (y >= 0) & (y < cells)
+    cell = torch.unique((y * cells + x)[inside])
+    if len(cell) < num_pillars:
+        raise ValueError(
+            f"lidar_pillars: num_pillars must be at most {len(cell)} in so small a grid, got {num_pillars}"
+        )
+    cell = cell[torch.randperm(len(cell), generator=generator)[:num_pillars]].sort().values
+    return torch.stack([torch.zeros_like(cell), torch.zeros_like(cell), cell // cells, cell % cells], dim=1)
 
 
 def lidar_points(num_points: int, seed: int = 0) -> Tensor:  # [N, 5]: x, y, z, intensity, dt

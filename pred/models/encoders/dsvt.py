@@ -28,7 +28,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-LENGTH_STEP = 8
+LENGTH_STEP = 16
 """Sets whose lengths round up to the same multiple of this attend together."""
 
 
@@ -218,15 +218,18 @@ class PaddedSets(NamedTuple):
     tables: list[tuple[int, int]]
     """Sets and length of each table."""
 
-    def attend(self, projected: Tensor, num_heads: int) -> Tensor:
-        """Scaled dot-product attention in every set: query, key and value of each pillar `[M, 3 C]` to `[M, C]`."""
-        slots = _Rearrange.apply(projected, self.pillar, self.slot, None)
+    def attend(self, query_key: Tensor, value: Tensor, num_heads: int) -> Tensor:
+        """Scaled dot-product attention in every set: query and key `[M, 2 C]` and value `[M, C]` to `[M, C]`."""
         sizes = [sets * length for sets, length in self.tables]
+        split = [
+            _Rearrange.apply(projected, self.pillar, self.slot, None).split(sizes) for projected in (query_key, value)
+        ]
         attended = []
-        for rows, valid, shape in zip(slots.split(sizes), self.valid.split(sizes), self.tables, strict=True):
+        for of_query_key, of_value, valid, shape in zip(*split, self.valid.split(sizes), self.tables, strict=True):
             # each [sets, H, length, C / H]
-            query, key, value = rows.view(*shape, 3, num_heads, -1).permute(2, 0, 3, 1, 4)
-            result = F.scaled_dot_product_attention(query, key, value, valid.view(shape)[:, None, None])
+            query, key = of_query_key.view(*shape, 2, num_heads, -1).permute(2, 0, 3, 1, 4)
+            values = of_value.view(*shape, num_heads, -1).transpose(1, 2)
+            result = F.scaled_dot_product_attention(query, key, values, valid.view(shape)[:, None, None])
             attended.append(result.transpose(1, 2).flatten(2).flatten(0, 1))
         return _Rearrange.apply(torch.cat(attended), self.slot, self.pillar, self.valid)
 
@@ -333,7 +336,7 @@ class SelfAttention(nn.Module):
         weight, bias = self.in_proj_weight, self.in_proj_bias
         query_key = F.linear(features + position, weight[: 2 * channels], bias[: 2 * channels])
         value = F.linear(features, weight[2 * channels :], bias[2 * channels :])
-        return self.out_proj(sets.attend(torch.cat([query_key, value], dim=1), self.num_heads))
+        return self.out_proj(sets.attend(query_key, value, self.num_heads))
 
 
 class PositionEmbedding(nn.Module):
