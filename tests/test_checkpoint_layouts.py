@@ -1,0 +1,324 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""Our encoders in the layouts of other frameworks, on the state dicts of the frameworks' own models."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from pred.checkpoint_layouts import (
+    FRAMEWORKS,
+    LayoutError,
+    Mmdet3dOptions,
+    export_state,
+    import_state,
+    layout,
+    shapes_of,
+)
+from tests.framework_layouts import (
+    MODELS,
+    Mmdet3dBevBackbone,
+    Mmdet3dSparseEncoder,
+    OpenPCDetBevBackbone,
+    OpenPCDetVoxelBackbone,
+    encoder_specs,
+    random_state,
+)
+
+BIASED = ("pcdet_nus_cp_vox01", "pcdet_nus_second", "pcdet_once_cp")
+SECOND_2D: dict[str, Any] = {
+    "widths": [128, 256],
+    "strides": [1, 2],
+    "layers": [5, 5],
+    "ups": [1, 2],
+    "outs": [256, 256],
+}
+BACKBONES_2D: dict[str, dict[str, Any]] = {
+    "pcdet_nus_second": {"before": 256, **SECOND_2D},
+    "pcdet_nus_dynpp": {
+        "before": 64, "widths": [64, 128, 256], "strides": [2, 2, 2], "layers": [3, 5, 5], "ups": [0.5, 1, 2],
+        "outs": [128, 128, 128],
+    },
+    "pcdet_once_pp": {
+        "before": 64, "widths": [64, 128, 256], "strides": [2, 2, 2], "layers": [3, 5, 5], "ups": [1, 2, 4],
+        "outs": [128, 128, 128],
+    },
+    "dsvt_nus": {
+        "before": 128, "widths": [128, 128, 256], "strides": [1, 2, 2], "layers": [1, 2, 2], "ups": [0.5, 1, 2],
+        "outs": [128, 128, 128], "residual": True,
+    },
+    "dsvt_waymo": {
+        "before": 192, "widths": [128, 128, 256], "strides": [1, 2, 2], "layers": [1, 2, 2], "ups": [1, 2, 4],
+        "outs": [128, 128, 128], "residual": True,
+    },
+}  # fmt: skip
+
+
+def encoder_state(model: str) -> dict[str, Tensor]:
+    return random_state(encoder_specs(model))
+
+
+def part(state: dict[str, Tensor], module: str) -> dict[str, Tensor]:
+    return {name.removeprefix(f"{module}."): value for name, value in state.items() if name.startswith(f"{module}.")}
+
+
+def some_sites(point_channels: int) -> tuple[Tensor, Tensor]:
+    """A small grid of 41 cells in z with a tenth of them active."""
+    generator = torch.Generator().manual_seed(1)
+    active = (torch.rand(1, 1, 41, 12, 12, generator=generator) < 0.1).double()
+    return torch.randn(1, point_channels, 41, 12, 12, generator=generator, dtype=torch.float64) * active, active
+
+
+def load_as_openpcdet(model: nn.Module, state: dict[str, Tensor]) -> None:
+    """What detector3d_template.py does: kernels whose shape differs are turned, what still differs is left out."""
+    own, taken = model.state_dict(), {}
+    for name, value in state.items():
+        if name in own and own[name].shape != value.shape and value.dim() == 5:
+            swapped = value.transpose(-1, -2)
+            value = swapped if swapped.shape == own[name].shape else value.permute(4, 0, 1, 2, 3)
+        if name in own and own[name].shape == value.shape:
+            taken[name] = value
+    assert taken.keys() == own.keys()
+    model.load_state_dict(taken)
+
+
+# Frameworks rebuilt
+
+
+@pytest.mark.parametrize("model", BIASED + ("pcdet_nus_tf", "pcdet_once_second", "pcdet_once_pvrcnn"))
+def test_voxel_backbones_compute_the_same_in_openpcdet_and_mmdetection3d(model: str) -> None:
+    state = encoder_state(model)
+    channels = state["backbone_3d.conv_input.0.weight"].shape[-1]
+    residual = "backbone_3d.conv1.0.conv1.weight" in state
+    reference = OpenPCDetVoxelBackbone(channels, residual, bias=model in BIASED)
+    reference.load_state_dict(part(state, "backbone_3d"))
+    openpcdet = OpenPCDetVoxelBackbone(channels, residual, bias=model in BIASED)
+    load_as_openpcdet(openpcdet, part(export_state(state, "openpcdet"), "backbone_3d"))
+    mmdet3d = Mmdet3dSparseEncoder(channels, residual)
+    mmdet3d.load_state_dict(part(export_state(state, "mmdet3d"), "pts_middle_encoder"))
+    sites = some_sites(channels)
+    with torch.no_grad():
+        expected, *others = (network.double().eval()(sites) for network in (reference, openpcdet, mmdet3d))
+    assert expected.shape == (1, 256, 2, 2) and (expected > 0).double().mean() > 0.02
+    assert torch.equal(others[0], expected)
+    # running_mean - bias is rounded to float32.
+    torch.testing.assert_close(others[1], expected, rtol=1e-5, atol=1e-6)
+    if model not in BIASED:
+        assert torch.equal(others[1], expected)
+
+
+@pytest.mark.parametrize("stride1_conv", [True, False])
+@pytest.mark.parametrize("model", BACKBONES_2D)
+def test_2d_backbones_compute_the_same_in_openpcdet_and_mmdetection3d(model: str, stride1_conv: bool) -> None:
+    state, sizes = encoder_state(model), BACKBONES_2D[model]
+    prefix = "" if model.startswith("dsvt") else "pts_"
+    exported = export_state(state, "mmdet3d", Mmdet3dOptions(stride1_conv=stride1_conv))
+    openpcdet = OpenPCDetBevBackbone(**sizes)
+    load_as_openpcdet(openpcdet, part(export_state(state, "openpcdet"), "backbone_2d"))
+    mmdet3d = Mmdet3dBevBackbone(prefix, **sizes, stride1_conv=stride1_conv)
+    modules = (f"{prefix}backbone.", f"{prefix}neck.")
+    mmdet3d.load_state_dict({name: value for name, value in exported.items() if name.startswith(modules)})
+    x = torch.randn(1, sizes["before"], 16, 16, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        expected, actual = openpcdet.eval()(x), mmdet3d.eval()(x)
+    assert expected.abs().max() > 0.1
+    # Conv2d and ConvTranspose2d of stride 1 sum in their own order.
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_deblock_that_is_not_transposed_computes_something_else() -> None:
+    """128 channels in and out: no shape tells, so that a wrong option would go unnoticed."""
+    state, sizes = encoder_state("pcdet_nus_dynpp"), BACKBONES_2D["pcdet_nus_dynpp"]
+    right, wrong = (export_state(state, "mmdet3d", Mmdet3dOptions(stride1_conv=conv)) for conv in (True, False))
+    assert shapes_of(right) == shapes_of(wrong)
+    x = torch.randn(1, 64, 8, 8, generator=torch.Generator().manual_seed(2))
+    outputs = []
+    for exported in (right, wrong):
+        network = Mmdet3dBevBackbone("pts_", **sizes)
+        network.load_state_dict({name: value for name, value in exported.items() if "voxel_encoder" not in name})
+        with torch.no_grad():
+            outputs.append(network.eval()(x))
+    assert not torch.allclose(outputs[0], outputs[1], atol=1e-2)
+
+
+@pytest.mark.parametrize("dynamic", [False, True])
+def test_pillar_networks_have_the_names_of_mmdetection3d(dynamic: bool) -> None:
+    state = encoder_state("pcdet_nus_dynpp")
+    exported = export_state(state, "mmdet3d", Mmdet3dOptions(dynamic_pillars=dynamic))
+    layers = nn.ModuleList()
+    for before, after in ((11, 32), (64, 64)):
+        linear, norm = nn.Linear(before, after, bias=False), nn.BatchNorm1d(after, eps=1e-3)
+        layer = nn.Sequential(linear, norm, nn.ReLU())
+        if not dynamic:
+            layer = nn.Sequential()
+            layer.add_module("linear", linear)
+            layer.add_module("norm", norm)
+        layers.append(layer)
+    network = nn.Module()
+    network.pfn_layers = layers
+    network.load_state_dict(part(exported, "pts_voxel_encoder"))
+    first = layers[0][0].weight
+    assert torch.equal(first, state["vfe.pfn_layers.0.linear.weight"])
+
+
+# Tables
+
+
+def test_names_and_shapes_of_mmdetection3d_by_hand() -> None:
+    """One of each way in which a tensor changes."""
+    layers = "pts_middle_encoder.encoder_layers.encoder_layer"
+    expected = {
+        "backbone_3d.conv_input.0.weight": ("pts_middle_encoder.conv_input.0.weight", (3, 3, 3, 5, 16)),
+        "backbone_3d.conv1.0.conv1.weight": (f"{layers}1.0.conv1.weight", (3, 3, 3, 16, 16)),
+        "backbone_3d.conv1.1.bn2.bias": (f"{layers}1.1.bn2.bias", (16,)),
+        "backbone_3d.conv2.0.0.weight": (f"{layers}1.2.0.weight", (3, 3, 3, 16, 32)),
+        "backbone_3d.conv2.0.1.running_var": (f"{layers}1.2.1.running_var", (32,)),
+        "backbone_3d.conv2.1.conv2.weight": (f"{layers}2.0.conv2.weight", (3, 3, 3, 32, 32)),
+        "backbone_3d.conv3.0.0.weight": (f"{layers}2.2.0.weight", (3, 3, 3, 32, 64)),
+        "backbone_3d.conv4.0.0.weight": (f"{layers}3.2.0.weight", (3, 3, 3, 64, 128)),
+        "backbone_3d.conv4.2.bn1.weight": (f"{layers}4.1.bn1.weight", (128,)),
+        "backbone_3d.conv_out.0.weight": ("pts_middle_encoder.conv_out.0.weight", (3, 1, 1, 128, 128)),
+        "backbone_2d.blocks.0.1.weight": ("pts_backbone.blocks.0.0.weight", (128, 256, 3, 3)),
+        "backbone_2d.blocks.1.17.num_batches_tracked": ("pts_backbone.blocks.1.16.num_batches_tracked", ()),
+        "backbone_2d.deblocks.0.0.weight": ("pts_neck.deblocks.0.0.weight", (256, 128, 1, 1)),
+        "backbone_2d.deblocks.1.0.weight": ("pts_neck.deblocks.1.0.weight", (256, 256, 2, 2)),
+    }
+    state = encoder_state("pcdet_nus_cp_vox01")
+    exported = export_state(state, "mmdet3d")
+    entries = {entry.ours: entry for entry in layout(shapes_of(state), "mmdet3d")}
+    for ours, (theirs, shape) in expected.items():
+        assert (entries[ours].theirs, tuple(exported[theirs].shape)) == (theirs, shape)
+    kernel = state["backbone_3d.conv3.0.0.weight"]
+    turned = exported["pts_middle_encoder.encoder_layers.encoder_layer2.2.0.weight"]
+    assert turned[0, 1, 2, 3, 4] == kernel[4, 0, 1, 2, 3]
+    assert len(exported) == len(state) - 16
+    folded = exported["pts_middle_encoder.encoder_layers.encoder_layer1.0.bn1.running_mean"]
+    mean, bias = state["backbone_3d.conv1.0.bn1.running_mean"], state["backbone_3d.conv1.0.conv1.bias"]
+    assert torch.equal(folded, mean - bias) and bias.abs().max() > 0
+
+
+@pytest.mark.parametrize("to", FRAMEWORKS)
+@pytest.mark.parametrize("model", MODELS)
+def test_a_round_trip_gives_every_bit_back(model: str, to: Any) -> None:
+    state = encoder_state(model)
+    exported = export_state(state, to)
+    assert all(type(name) is str and value.is_contiguous() for name, value in exported.items())
+    if to == "mmdet3d" and model in BIASED:
+        with pytest.raises(LayoutError, match=r"residual convolutions must have no bias.*conv1\.0\.conv1\.bias"):
+            import_state(exported, shapes_of(state), to)
+        return
+    options = Mmdet3dOptions(stride1_conv=not model.startswith("dsvt") and "dsvt" not in model)
+    back = import_state(exported, shapes_of(state), to, options)
+    assert back.keys() == state.keys()
+    for name, value in state.items():
+        assert torch.equal(back[name], value) and back[name].dtype == value.dtype, name
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_state_dicts_of_the_framework_itself_are_imported(model: str) -> None:
+    """OpenPCDet saves (out, z, y, x, in) with spconv 2."""
+    state = encoder_state(model)
+    back = import_state(dict(state), shapes_of(state), "openpcdet")
+    assert all(torch.equal(back[name], value) for name, value in state.items())
+
+
+# Strictness
+
+
+def changed(state: dict[str, Tensor], how: str) -> dict[str, Tensor]:
+    state = dict(state)
+    name = "backbone_3d.conv2.1.conv1.weight"
+    if how == "add":
+        state["backbone_3d.conv2.1.conv3.weight"] = torch.zeros(4)
+    elif how == "remove":
+        del state[name]
+    elif how == "rename":
+        state["backbone_3d.conv2.1.convolution.weight"] = state.pop(name)
+    elif how == "resize":
+        state[name] = torch.zeros(32, 3, 3, 3, 31)
+    elif how == "nan":
+        state[name] = torch.full_like(state[name], float("nan"))
+    elif how == "type":
+        state[name] = state[name].double()
+    return state
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("add", r"left over backbone_3d\.conv2\.1\.conv3\.weight \(4\)"),
+        ("remove", r"missing   backbone_3d\.conv2\.1\.conv1\.weight \(3, 3, 3, 32, 32\)"),
+        ("rename", r"(?s)missing   backbone_3d\.conv2\.1\.conv1.*left over backbone_3d\.conv2\.1\.convolution"),
+        ("resize", r"shape     backbone_3d\.conv2\.1\.conv1\.weight must be .*32, 32\), got \(32, 3, 3, 3, 31\)"),
+        ("nan", r"conv2\.1\.conv1\.weight: weights must be finite, got 27648 of 27648"),
+        ("type", r"conv2\.1\.conv1\.weight: must be float32, got float64"),
+    ],
+)
+def test_import_refuses_what_is_not_the_encoder(how: str, message: str) -> None:
+    state = encoder_state("pcdet_nus_tf")
+    with pytest.raises(LayoutError, match=message):
+        import_state(changed(export_state(state, "openpcdet"), how), shapes_of(state), "openpcdet")
+
+
+@pytest.mark.parametrize("to", FRAMEWORKS)
+def test_export_refuses_what_has_no_place(to: Any) -> None:
+    state = encoder_state("pcdet_nus_tf")
+    with pytest.raises(LayoutError, match=r"every tensor must have a place in the framework, got none for field\.w"):
+        export_state(state | {"field.w": torch.zeros(1)}, to)
+    with pytest.raises(LayoutError, match="weights must be finite"):
+        export_state(changed(state, "nan"), to)
+    with pytest.raises(LayoutError, match="must be float32, got float64"):
+        export_state(changed(state, "type"), to)
+
+
+def test_kernels_that_openpcdet_would_turn_wrongly_are_refused() -> None:
+    """Three channels out of a kernel with edges of 3: (3, 3, 3, 16, 3) becomes (3, 3, 3, 3, 16), not its transpose."""
+    state = {"backbone_3d.conv_out.0.weight": torch.randn(3, 3, 3, 3, 16)}
+    with pytest.raises(LayoutError, match=r"more output channels than their edge is long.*conv_out"):
+        export_state(state, "openpcdet")
+    assert export_state(state, "mmdet3d")["pts_middle_encoder.conv_out.0.weight"].shape == (3, 3, 3, 16, 3)
+
+
+def test_the_order_of_kernels_is_told_by_shape_or_asked_for() -> None:
+    cube = {"backbone_3d.conv_out.0.weight": torch.randn(3, 3, 3, 3, 3)}
+    with pytest.raises(LayoutError, match=r"got none that does; say it with --kernel-order"):
+        import_state(cube, shapes_of(cube), "mmdet3d", Mmdet3dOptions(stride1_conv=False))
+    named = {"pts_middle_encoder.conv_out.0.weight": cube["backbone_3d.conv_out.0.weight"]}
+    options = Mmdet3dOptions(prefix="pts_", stride1_conv=False)
+    kept = import_state(named, shapes_of(cube), "mmdet3d", options, "krsc")
+    turned = import_state(named, shapes_of(cube), "mmdet3d", options, "dhwio")
+    (kernel,) = cube.values()
+    assert torch.equal(*kept.values(), kernel) and torch.equal(*turned.values(), kernel.permute(4, 0, 1, 2, 3))
+    # Another kernel of the file tells it.
+    other = cube | {"backbone_3d.conv_input.0.weight": torch.randn(16, 3, 3, 3, 5)}
+    exported = {f"pts_middle_{name.replace('backbone_3d', 'encoder')}": value for name, value in other.items()}
+    assert torch.equal(import_state(exported, shapes_of(other), "mmdet3d", options)[next(iter(cube))], kernel)
+    # A file has one order.
+    mixed = encoder_state("pcdet_nus_tf")
+    turned_one = mixed | {
+        "backbone_3d.conv_out.0.weight": mixed["backbone_3d.conv_out.0.weight"].permute(1, 2, 3, 4, 0)
+    }
+    with pytest.raises(LayoutError, match="must have one order"):
+        import_state(turned_one, shapes_of(mixed), "openpcdet")
+
+
+def test_deblocks_of_mmdetection3d_are_told_by_shape_or_asked_for() -> None:
+    square = encoder_state("pcdet_nus_dynpp")
+    with pytest.raises(LayoutError, match=r"as many channels in as out; say it with --stride1-deblock"):
+        import_state(export_state(square, "mmdet3d"), shapes_of(square), "mmdet3d")
+    oblong = encoder_state("pcdet_once_pp")
+    for conv in (True, False):
+        exported = export_state(oblong, "mmdet3d", Mmdet3dOptions(stride1_conv=conv, dynamic_pillars=conv))
+        back = import_state(exported, shapes_of(oblong), "mmdet3d")
+        assert all(torch.equal(back[name], value) for name, value in oblong.items())
+
+
+def test_half_precision_is_widened() -> None:
+    state = encoder_state("pcdet_once_second")
+    half = {name: value.half() if value.is_floating_point() else value for name, value in state.items()}
+    back = import_state(half, shapes_of(state), "openpcdet")
+    assert all(torch.equal(back[name], half[name].to(state[name].dtype)) for name in state)
