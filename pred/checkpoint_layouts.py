@@ -472,7 +472,7 @@ def _options_of_file(state: Mapping[str, Tensor], shapes: Shapes, options: Mmdet
     prefix, dynamic, conv = options.prefix, options.dynamic_pillars, options.stride1_conv
     if prefix is None:
         prefix = "pts_" if any(name.startswith("pts_") for name in state) else ""
-    dynamic = dynamic or any(re.search(r"\bvoxel_encoder\.pfn_layers\.0\.0\.weight$", name) for name in state)
+    dynamic = dynamic or any(re.search(r"voxel_encoder\.pfn_layers\.0\.0\.weight$", name) for name in state)
     if conv is None:
         said: set[bool] = set()
         deblocks = {name: shape for name, shape in shapes.items() if is_stride1_deblock(name, shape)}

@@ -229,7 +229,6 @@ def import_weights(arguments: list[str]) -> None:
         "pred import",
         "Make a run folder of the encoder in a checkpoint of OpenPCDet, DSVT, mmdetection3d or this package.",
         PretrainConfig,
-        skip={"run"},
     )
     parser.add_argument("file", metavar="FILE", type=Path, help="checkpoint")
     parser.add_argument("--out", type=Path, required=True, help="run folder to make")
@@ -243,7 +242,7 @@ def import_weights(arguments: list[str]) -> None:
     parsed = parser.parse_args(arguments)
     from pred.export import import_encoder
 
-    config = build(parser, PretrainConfig, parsed, skip={"run"})
+    config = build(parser, PretrainConfig, parsed)
     import_encoder(config, parsed.file, parsed.out, _mmdet3d_options(parsed), parsed.kernel_order)
 
 

@@ -10,6 +10,7 @@ command that reads a run can use. `pred.checkpoint_layouts` holds the tables, `p
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +160,7 @@ def import_encoder(
         CheckpointError: the file cannot be read, or its encoder is not this one; the text names each difference.
         RunFolderError: the folder holds a run.
     """
+    config = replace(config, run=str(out))
     model = build_model(config)
     imported = load_encoder(model.encoder, file, options, kernel_order)
     folder = RunFolder(out)

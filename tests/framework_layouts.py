@@ -87,7 +87,7 @@ class SparseConvolution(nn.Module):
 
 
 class SparseSequential(nn.Sequential):
-    def forward(self, sites: Sites) -> Sites:  # type: ignore[override]
+    def forward(self, sites: Sites) -> Sites:
         for layer in self:
             if isinstance(layer, nn.BatchNorm3d | nn.ReLU):
                 sites = layer(sites[0]) * sites[1], sites[1]
@@ -161,6 +161,7 @@ class Mmdet3dSparseEncoder(nn.Module):
         super().__init__()
         self.conv_input = sparse_layer("dhwio", point_channels, 16)
         self.encoder_layers = SparseSequential()
+        channels: tuple[tuple[int, ...], ...]
         if residual:
             channels = ((16, 16, 32), (32, 32, 64), (64, 64, 128), (128, 128))
         else:

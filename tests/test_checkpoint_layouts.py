@@ -152,17 +152,15 @@ def test_pillar_networks_have_the_names_of_mmdetection3d(dynamic: bool) -> None:
     layers = nn.ModuleList()
     for before, after in ((11, 32), (64, 64)):
         linear, norm = nn.Linear(before, after, bias=False), nn.BatchNorm1d(after, eps=1e-3)
-        layer = nn.Sequential(linear, norm, nn.ReLU())
-        if not dynamic:
-            layer = nn.Sequential()
-            layer.add_module("linear", linear)
-            layer.add_module("norm", norm)
-        layers.append(layer)
+        named = {"linear": linear, "norm": norm}
+        layers.append(nn.Sequential(linear, norm, nn.ReLU()) if dynamic else nn.ModuleDict(named))
     network = nn.Module()
     network.pfn_layers = layers
     network.load_state_dict(part(exported, "pts_voxel_encoder"))
-    first = layers[0][0].weight
-    assert torch.equal(first, state["vfe.pfn_layers.0.linear.weight"])
+    for place, name in enumerate(("linear", "norm")):
+        for layer in range(2):
+            weight = network.state_dict()[f"pfn_layers.{layer}.{place if dynamic else name}.weight"]
+            assert torch.equal(weight, state[f"vfe.pfn_layers.{layer}.{name}.weight"])
 
 
 # Tables
@@ -285,14 +283,15 @@ def test_kernels_that_openpcdet_would_turn_wrongly_are_refused() -> None:
 
 def test_the_order_of_kernels_is_told_by_shape_or_asked_for() -> None:
     cube = {"backbone_3d.conv_out.0.weight": torch.randn(3, 3, 3, 3, 3)}
-    with pytest.raises(LayoutError, match=r"got none that does; say it with --kernel-order"):
-        import_state(cube, shapes_of(cube), "mmdet3d", Mmdet3dOptions(stride1_conv=False))
     named = {"pts_middle_encoder.conv_out.0.weight": cube["backbone_3d.conv_out.0.weight"]}
     options = Mmdet3dOptions(prefix="pts_", stride1_conv=False)
+    with pytest.raises(LayoutError, match=r"got none that does; say it with --kernel-order"):
+        import_state(named, shapes_of(cube), "mmdet3d", options)
     kept = import_state(named, shapes_of(cube), "mmdet3d", options, "krsc")
     turned = import_state(named, shapes_of(cube), "mmdet3d", options, "dhwio")
     (kernel,) = cube.values()
-    assert torch.equal(*kept.values(), kernel) and torch.equal(*turned.values(), kernel.permute(4, 0, 1, 2, 3))
+    assert torch.equal(kept["backbone_3d.conv_out.0.weight"], kernel)
+    assert torch.equal(turned["backbone_3d.conv_out.0.weight"], kernel.permute(4, 0, 1, 2, 3))
     # Another kernel of the file tells it.
     other = cube | {"backbone_3d.conv_input.0.weight": torch.randn(16, 3, 3, 3, 5)}
     exported = {f"pts_middle_{name.replace('backbone_3d', 'encoder')}": value for name, value in other.items()}
