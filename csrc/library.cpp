@@ -69,6 +69,18 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "SymInt max_points, SymInt max_voxels) -> (Tensor voxels, Tensor coords, Tensor counts, Tensor point_to_slot)");
   m.def("voxelize_hard_backward(Tensor grad, Tensor point_to_slot) -> Tensor");
 
+  m.def(
+      "build_rulebook(Tensor indices, SymInt batch_size, SymInt[] spatial_shape, SymInt[] kernel_size, "
+      "SymInt[] stride, SymInt[] padding, SymInt[] dilation, bool submanifold) -> "
+      "(Tensor out_indices, Tensor out_to_in, Tensor in_to_out)");
+  // weight: [O, K, C].
+  m.def("sparse_conv(Tensor features, Tensor weight, Tensor? bias, Tensor out_to_in, Tensor in_to_out) -> Tensor");
+  m.def(
+      "sparse_conv_backward(Tensor grad, Tensor features, Tensor weight, Tensor out_to_in, Tensor in_to_out, "
+      "bool need_features, bool need_weight) -> (Tensor, Tensor)");
+  m.def("sparse_max_pool(Tensor features, Tensor out_to_in, Tensor in_to_out) -> (Tensor out, Tensor winner)");
+  m.def("sparse_max_pool_backward(Tensor grad, Tensor winner, Tensor in_to_out) -> Tensor");
+
   m.def("farthest_point_sample(Tensor points, Tensor batch_offsets, SymInt num_samples, SymInt start) -> Tensor");
   m.def(
       "knn(Tensor points, Tensor batch_offsets, Tensor queries, Tensor query_offsets, SymInt k) -> "

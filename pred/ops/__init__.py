@@ -12,6 +12,7 @@ oracle; :mod:`pred.ops.reference` gathers them.
 from pred.ops._composite import Composite
 from pred.ops._sampling import SampledWithGrad
 from pred.ops.ball_query import Ball, ball_query
+from pred.ops.build_rulebook import Rulebook, build_rulebook
 from pred.ops.composite_alpha import composite_alpha
 from pred.ops.composite_rays import composite_rays
 from pred.ops.decode_field import DecodedField, decode_field
@@ -23,6 +24,8 @@ from pred.ops.sample_pdf import sample_pdf
 from pred.ops.sample_volume import sample_volume, sample_volume_with_grad
 from pred.ops.sdf_to_alpha import sdf_to_alpha
 from pred.ops.segment_reduce import segment_reduce
+from pred.ops.sparse_conv import sparse_conv
+from pred.ops.sparse_max_pool import sparse_max_pool
 from pred.ops.voxelize import Voxels, voxelize
 from pred.ops.voxelize_hard import HardVoxels, voxelize_hard
 
@@ -40,6 +43,9 @@ __all__ = [  # in the order of docs/ops
     "voxelize",
     "voxelize_hard",
     "segment_reduce",
+    "build_rulebook",
+    "sparse_conv",
+    "sparse_max_pool",
     "farthest_point_sample",
     "knn",
     "ball_query",
@@ -48,6 +54,7 @@ __all__ = [  # in the order of docs/ops
     "Composite",
     "Voxels",
     "HardVoxels",
+    "Rulebook",
     "Neighbors",
     "Ball",
 ]

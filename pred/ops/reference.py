@@ -3,6 +3,7 @@
 """The plain PyTorch references of all ops, under the ops' own names."""
 
 from pred.ops.ball_query import ball_query_reference as ball_query
+from pred.ops.build_rulebook import build_rulebook_reference as build_rulebook
 from pred.ops.composite_alpha import composite_alpha_reference as composite_alpha
 from pred.ops.composite_rays import composite_rays_reference as composite_rays
 from pred.ops.decode_field import decode_field_reference as decode_field
@@ -16,6 +17,8 @@ from pred.ops.sample_volume import sample_volume_reference as sample_volume
 from pred.ops.sample_volume import sample_volume_with_grad_reference as sample_volume_with_grad
 from pred.ops.sdf_to_alpha import sdf_to_alpha_reference as sdf_to_alpha
 from pred.ops.segment_reduce import segment_reduce_reference as segment_reduce
+from pred.ops.sparse_conv import sparse_conv_reference as sparse_conv
+from pred.ops.sparse_max_pool import sparse_max_pool_reference as sparse_max_pool
 from pred.ops.voxelize import voxelize_reference as voxelize
 from pred.ops.voxelize_hard import voxelize_hard_reference as voxelize_hard
 
@@ -33,6 +36,9 @@ __all__ = [  # in the order of docs/ops
     "voxelize",
     "voxelize_hard",
     "segment_reduce",
+    "build_rulebook",
+    "sparse_conv",
+    "sparse_max_pool",
     "farthest_point_sample",
     "knn",
     "ball_query",

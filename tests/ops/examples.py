@@ -212,6 +212,46 @@ def _segment_reduce(source: Source) -> Arguments:
     }
 
 
+def _build_rulebook(source: Source) -> Arguments:
+    """Half of the cells are active, so that most taps find a site."""
+    frames, shape = source.size(2, 1, 4), (3, 8, 2 + source.count // 8)
+    z, y, x = shape
+    site = source.normal(frames * z * y * x).argsort()[: source.count]
+    return {
+        "indices": torch.stack([site // (z * y * x), site // (y * x) % z, site // x % y, site % x], dim=1),
+        "batch_size": frames,
+        "spatial_shape": shape,
+    }
+
+
+def _tables(source: Source, **kernel: Any) -> Arguments:
+    rulebook = reference.build_rulebook(**_build_rulebook(source), **kernel)
+    return {"out_to_in": rulebook.out_to_in, "in_to_out": rulebook.in_to_out}
+
+
+def _convolution(source: Source, tables: Arguments) -> Arguments:
+    channels, taps = source.size(5, 0, 70), tables["out_to_in"].shape[1]
+    outputs = source.size(7, 0, 70)
+    return {
+        "features": source.normal(source.count, channels),
+        "weight": source.normal(outputs, taps, channels) * (taps * max(1, channels)) ** -0.5,
+        "bias": source.normal(outputs),
+    } | tables
+
+
+def _sparse_conv(source: Source) -> Arguments:
+    return _convolution(source, _tables(source, kernel_size=3, stride=2, padding=1))
+
+
+def _submanifold_conv(source: Source) -> Arguments:
+    return _convolution(source, _tables(source, kernel_size=(1, 3, 3), submanifold=True))
+
+
+def _sparse_max_pool(source: Source) -> Arguments:
+    features = source.dyadic(-2, 2, source.count, source.size(5, 0, 70), parts=4)  # many are equal
+    return {"features": features} | _tables(source, kernel_size=2, stride=2, padding=1)
+
+
 def _clouds(source: Source, frames: int) -> Arguments:
     """Squared distances are exact in float32; many are equal."""
     return {
@@ -393,6 +433,13 @@ _FIELD: dict[str, Any] = {
     "tolerance": 5,
 }
 
+_SPARSE: dict[str, Any] = {
+    "differentiable": ("features", "weight", "bias"),
+    "features": ("features", "weight", "bias"),
+    "order": None,
+    "tolerance": 4,  # a sum of n products carries the rounding of n additions
+}
+
 _CLOUDS: dict[str, Any] = {"features": ("points", "queries"), "reference_compiles": False}
 
 EXAMPLES = [
@@ -411,6 +458,18 @@ EXAMPLES = [
         tolerance=4,  # a sum of n rows carries the rounding of n additions
         many=20000,
     ),
+    *_examples(
+        "build_rulebook",
+        _build_rulebook,
+        {"submanifold": True},
+        {"kernel_size": (3, 2, 4), "stride": (2, 1, 3), "padding": (1, 0, 2), "dilation": (1, 2, 1)},
+        order=0,
+        many=9000,
+        reference_compiles=False,
+    ),
+    *_examples("sparse_conv", _sparse_conv, {}, {"bias": None}, **_SPARSE),
+    *_examples("sparse_conv", _submanifold_conv, **_SPARSE),
+    *_examples("sparse_max_pool", _sparse_max_pool, **_SPARSE),
     *_examples("voxelize", _voxelize, order=0, many=70000, **_CLOUDS),
     *_examples("voxelize_hard", _voxelize_hard, differentiable=("points",), order=None, many=70000, **_CLOUDS),
     *_examples("farthest_point_sample", _farthest_point_sample, {}, {"start": 4}, order=0, many=9000, **_CLOUDS),

@@ -165,7 +165,8 @@ def compilations(example: Example, counts: Sequence[int], sizes: type[Source]) -
 @every_example
 def test_vmap_is_refused_by_name(backend: str, example: Example) -> None:
     arguments = example.example(6)
-    tensors = {k: v for k, v in arguments.items() if isinstance(v, Tensor) and v.is_floating_point()}
+    every = {k: v for k, v in arguments.items() if isinstance(v, Tensor)}
+    tensors = {k: v for k, v in every.items() if v.is_floating_point()} or every
     rest = {name: value for name, value in arguments.items() if name not in tensors}
     batched = {name: torch.stack([value, value]) for name, value in tensors.items()}
     with pytest.raises(RuntimeError, match=rf"{example.op}\w*: torch.vmap is not supported"):

@@ -1,0 +1,163 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+#include "ops/sparse_conv.h"
+
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/ops.h>
+
+#include <algorithm>
+#include <memory>
+#include <optional>
+#include <tuple>
+
+#include "common/allocate.h"
+#include "common/blocks.h"
+#include "common/check.h"
+#include "ops/sparse_tables.h"
+
+namespace pred {
+namespace {
+
+PRED_KERNELS_BY_STORAGE(SparseConvKernels, sparse_conv)
+
+// Sizes and contiguous arguments of both ops.
+struct Problem {
+  Tensor features, weight, out_to_in, in_to_out;  // [M, C], [O, K, C], [M', K], [M, K]
+  int64_t rows_in, rows_out, inputs, outputs, taps;
+
+  Problem(const char* op, const Tensor& features_in, const Tensor& weight_in, const Tensor& out_to_in_in,
+          const Tensor& in_to_out_in) {
+    check_cpu_tensor(op, "features", features_in, 2, features_in.scalar_type());
+    check_cpu_tensor(op, "weight", weight_in, 3, features_in.scalar_type());
+    inputs = features_in.size(1), outputs = weight_in.size(0), taps = weight_in.size(1);
+    PRED_CHECK(weight_in.size(2) == inputs, op, ": weight must have shape [O, K, ", inputs, "], got ",
+               shape_text(weight_in));
+    rows_in = features_in.size(0), rows_out = table_rows(op, "out_to_in", out_to_in_in);
+    out_to_in = checked_table(op, "out_to_in", out_to_in_in, rows_out, taps, rows_in);
+    in_to_out = checked_table(op, "in_to_out", in_to_out_in, rows_in, taps, rows_out);
+    features = torch::stable::contiguous(features_in);
+    weight = torch::stable::contiguous(weight_in);
+  }
+};
+
+// out [rows, outputs] of a product along a table, whose matrices are W_k, or W_k^T if `transposed`.
+template <typename S>
+void product(const Problem& in, const Tensor& table, const S* source, bool transposed, const S* bias, S* out) {
+  using T = Compute<S>;
+  const SparseConvKernels<S>& k = sparse_conv_kernels<S>();
+  SparseConvArgs<S> a{
+      table.const_data_ptr<int32_t>(), in.taps, in.inputs, in.outputs, source, nullptr, 0, bias, nullptr};
+  if (transposed) std::swap(a.inputs, a.outputs);
+  a.packed_size = k.packed_size(a.inputs, a.outputs);
+  const auto packed = allocate_array<char>(in.taps * a.packed_size * int64_t(sizeof(Factor<S>)) + Arena::kAlignment);
+  Factor<S>* matrices = Arena(packed.get()).template take<Factor<S>>(in.taps * a.packed_size);
+  const S* weight = storage<S>(in.weight);
+  const int64_t tap_stride = in.inputs, output_stride = in.taps * in.inputs;
+  parallel(in.taps, 1, [&](int64_t begin, int64_t end) {
+    const auto scratch = allocate_array<T>(a.inputs * a.outputs);
+    for (int64_t tap = begin; tap < end; ++tap) {
+      k.pack(weight + tap * tap_stride, transposed ? output_stride : 1, transposed ? 1 : output_stride, a.inputs,
+             a.outputs, scratch.get(), matrices + tap * a.packed_size);
+    }
+  });
+  a.packed = matrices;
+  const Blocks tiles{table.size(0), kSparseTile};
+  parallel(tiles.count(), 1, [&](int64_t first, int64_t last) {
+    const auto scratch = allocate_array<char>(k.scratch_bytes(a));
+    k.product(a, out, scratch.get(), tiles.begin(first), tiles.end(last - 1));
+  });
+}
+
+// The sums of a tap are made block by block, so that few taps occupy many threads. Blocks depend on sizes alone.
+Blocks weight_blocks(const Problem& in) {
+  constexpr int64_t kTasks = 64, kLeast = 2048;
+  const int64_t blocks = std::clamp<int64_t>(in.rows_out / kLeast, 1, std::max<int64_t>(1, kTasks / in.taps));
+  return {in.rows_out, std::max<int64_t>(1, (in.rows_out + blocks - 1) / blocks)};
+}
+
+template <typename S>
+void weight_gradient(const Problem& in, const S* grad, S* out) {
+  using T = Compute<S>;
+  const SparseConvKernels<S>& k = sparse_conv_kernels<S>();
+  const SparseConvArgs<S> a{in.out_to_in.const_data_ptr<int32_t>(),
+                            in.taps,
+                            in.inputs,
+                            in.outputs,
+                            storage<S>(in.features),
+                            nullptr,
+                            0,
+                            nullptr,
+                            grad};
+  const int64_t columns = k.columns(in.inputs), size = in.outputs * columns;
+  const Blocks blocks = weight_blocks(in);
+  const int64_t count = blocks.count();
+  const auto sums = allocate_array<T>(in.taps * count * size);
+  parallel(in.taps * count, 1, [&](int64_t first, int64_t last) {
+    const auto scratch = allocate_array<char>(k.scratch_bytes(a));
+    for (int64_t task = first; task < last; ++task) {
+      T* part = sums.get() + task * size;
+      std::fill_n(part, size, T(0));
+      k.weight(a, task / count, part, scratch.get(), blocks.begin(task % count), blocks.end(task % count));
+    }
+  });
+  parallel(in.taps, 1, [&](int64_t first, int64_t last) {
+    for (int64_t tap = first; tap < last; ++tap) {
+      for (int64_t o = 0; o < in.outputs; ++o) {
+        S* to = out + (o * in.taps + tap) * in.inputs;
+        for (int64_t c = 0; c < in.inputs; ++c) {
+          T sum = 0;
+          for (int64_t block = 0; block < count; ++block) sum += sums[(tap * count + block) * size + o * columns + c];
+          to[c] = narrow<S>(sum);
+        }
+      }
+    }
+  });
+}
+
+Tensor sparse_conv(const Tensor& features, const Tensor& weight, const std::optional<Tensor>& bias_in,
+                   const Tensor& out_to_in, const Tensor& in_to_out) {
+  const char* op = "sparse_conv";
+  return PRED_DISPATCH_STORAGE(op, features.scalar_type(), [&] {
+    const Problem in(op, features, weight, out_to_in, in_to_out);
+    Tensor bias;
+    if (bias_in) {
+      check_cpu_tensor(op, "bias", *bias_in, 1, features.scalar_type());
+      check_sizes(op, "bias", *bias_in, {in.outputs});
+      bias = torch::stable::contiguous(*bias_in);
+    }
+    Tensor out = torch::stable::new_empty(in.features, {in.rows_out, in.outputs});
+    if (in.outputs == 0) return out;
+    product<S>(in, in.out_to_in, storage<S>(in.features), false, bias_in ? storage<S>(bias) : nullptr,
+               mutable_storage<S>(out));
+    return out;
+  });
+}
+
+std::tuple<Tensor, Tensor> sparse_conv_backward(const Tensor& grad_in, const Tensor& features, const Tensor& weight,
+                                                const Tensor& out_to_in, const Tensor& in_to_out, bool need_features,
+                                                bool need_weight) {
+  const char* op = "sparse_conv_backward";
+  return PRED_DISPATCH_STORAGE(op, features.scalar_type(), [&] {
+    const Problem in(op, features, weight, out_to_in, in_to_out);
+    check_cpu_tensor(op, "grad", grad_in, 2, features.scalar_type());
+    check_sizes(op, "grad", grad_in, {in.rows_out, in.outputs});
+    const Tensor grad = torch::stable::contiguous(grad_in);
+    Tensor out_features = torch::stable::new_empty(in.features, {need_features ? in.rows_in : 0, in.inputs});
+    Tensor out_weight = torch::stable::new_empty(in.weight, {need_weight ? in.outputs : 0, in.taps, in.inputs});
+    if (need_features && in.inputs > 0) {
+      product<S>(in, in.in_to_out, storage<S>(grad), true, nullptr, mutable_storage<S>(out_features));
+    }
+    if (need_weight && out_weight.numel() > 0) {
+      weight_gradient<S>(in, storage<S>(grad), mutable_storage<S>(out_weight));
+    }
+    return std::make_tuple(out_features, out_weight);
+  });
+}
+
+}  // namespace
+}  // namespace pred
+
+STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) {
+  m.impl("sparse_conv", TORCH_BOX(&pred::sparse_conv));
+  m.impl("sparse_conv_backward", TORCH_BOX(&pred::sparse_conv_backward));
+}
