@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pred.checkpoint_layouts import (
@@ -19,6 +20,8 @@ from pred.checkpoint_layouts import (
     layout,
     shapes_of,
 )
+from pred.export_check import specs_of
+from pred.models.encoders.pillars import PillarEncoder, PillarEncoderConfig
 from tests.framework_layouts import (
     MODELS,
     Mmdet3dBevBackbone,
@@ -161,6 +164,78 @@ def test_pillar_networks_have_the_names_of_mmdetection3d(dynamic: bool) -> None:
         for layer in range(2):
             weight = network.state_dict()[f"pfn_layers.{layer}.{place if dynamic else name}.weight"]
             assert torch.equal(weight, state[f"vfe.pfn_layers.{layer}.{name}.weight"])
+
+
+# Frameworks rebuilt, from points to the map
+
+
+class PlainPillars(nn.Module):
+    """DynamicPillarVFE (names ``linear``, ``norm``) or DynamicPillarFeatureNet (``0``, ``1``), pillar by pillar."""
+
+    def __init__(self, names: tuple[str, str], widths: list[tuple[int, int]]) -> None:
+        super().__init__()
+        layers = (
+            {names[0]: nn.Linear(*width, bias=False), names[1]: nn.BatchNorm1d(width[1], eps=1e-3)} for width in widths
+        )
+        self.pfn_layers = nn.ModuleList(nn.ModuleDict(layer) for layer in layers)
+
+    def forward(self, points: Tensor, size: tuple[float, ...], low: tuple[float, ...], grid: tuple[int, int]) -> Tensor:
+        """Map [1, C, ny, nx] of one frame's points [N, D], all inside the range."""
+        cells = ((points[:, :3] - torch.tensor(low)) / torch.tensor(size)).floor()
+        centres = (cells + 0.5) * torch.tensor(size) + torch.tensor(low)
+        canvas = None
+        for cell in torch.unique(cells, dim=0):
+            inside = (cells == cell).all(dim=1)
+            own = points[inside]
+            features = torch.cat([own, own[:, :3] - own[:, :3].mean(0), own[:, :3] - centres[inside]], dim=1)
+            for number, layer in enumerate(self.pfn_layers, start=1):
+                linear, norm = layer.values()
+                features = F.relu(norm(linear(features)))
+                largest = features.max(dim=0).values
+                if number < len(self.pfn_layers):
+                    features = torch.cat([features, largest.expand_as(features)], dim=1)
+            if canvas is None:
+                canvas = features.new_zeros(1, len(largest), *grid)
+            canvas[0, :, int(cell[1]), int(cell[0])] = largest
+        assert canvas is not None
+        return canvas
+
+
+@pytest.mark.parametrize("to", ["openpcdet", "dsvt", "mmdet3d", "mmdet3d dynamic"])
+def test_pillar_encoder_computes_the_same_in_each_framework(to: str, backend: str) -> None:
+    config = PillarEncoderConfig(
+        pillar_size=(0.8, 0.8), vfe_filters=[16, 24], layer_nums=[1, 2], layer_strides=[2, 2], num_filters=[16, 32],
+        upsample_strides=[1, 2], num_upsample_filters=[24, 16],
+    )  # fmt: skip
+    point_range = (-6.4, -9.6, -3.0, 6.4, 9.6, 3.0)
+    torch.manual_seed(0)
+    encoder = PillarEncoder(config, point_range).eval()
+    specs = specs_of(encoder.state_dict())
+    encoder.load_state_dict(random_state(specs))
+    low, high = torch.tensor(point_range[:3]), torch.tensor(point_range[3:])
+    points = torch.rand(300, 5) * torch.cat([high - low, torch.tensor([255.0, 0.5])]) + F.pad(low, (0, 2))
+    framework: Any = to.split()[0]
+    dynamic = to.endswith("dynamic")
+    exported = export_state(encoder.state_dict(), framework, Mmdet3dOptions(dynamic_pillars=dynamic))
+    prefix = "pts_voxel_encoder." if framework == "mmdet3d" else "vfe."
+    pillars = PlainPillars(("0", "1") if dynamic else ("linear", "norm"), [(11, 8), (16, 24)])
+    pillars.load_state_dict({name.removeprefix(prefix): x for name, x in exported.items() if name.startswith(prefix)})
+    sizes: dict[str, Any] = {
+        "before": 24, "widths": [16, 32], "strides": [2, 2], "layers": [1, 2], "ups": [1, 2], "outs": [24, 16],
+    }  # fmt: skip
+    if framework == "mmdet3d":
+        backbone: nn.Module = Mmdet3dBevBackbone("pts_", **sizes)
+        rest = {name: value for name, value in exported.items() if not name.startswith(prefix)}
+    else:
+        backbone = OpenPCDetBevBackbone(**sizes)
+        rest = {name.removeprefix("backbone_2d."): x for name, x in exported.items() if not name.startswith(prefix)}
+    backbone.load_state_dict(rest)
+    with torch.no_grad():
+        expected = encoder(points, torch.tensor([0, len(points)]))
+        canvas = pillars.eval()(points, encoder.voxel_size, point_range[:3], (24, 16))
+        actual = backbone.eval()(canvas)
+    assert expected.shape == (1, 40, 12, 8) and expected.std() > 0.1
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-4)
 
 
 # Tables
