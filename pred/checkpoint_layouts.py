@@ -52,28 +52,40 @@ class LayoutError(ValueError):
 
 
 @dataclass(frozen=True)
-class Mmdet3dOptions:
-    """What differs between mmdetection3d's own configurations. None: as in those of the encoder's kind."""
+class LayoutOptions:
+    """What differs between the configurations of one framework. None: as in its own for the encoder's kind."""
 
-    prefix: Literal["pts_", ""] | None = None
-    """Before the modules' names: ``pts_`` (CenterPoint; default for pillars and voxels), none (VoxelNet, and
-    projects/DSVT; default for DSVT)."""
     stride1_conv: bool | None = None
-    """`use_conv_for_no_stride` of SECONDFPN: True in the nuScenes CenterPoint configurations (default for pillars and
-    voxels), False in projects/DSVT (default for DSVT) and in SECONDFPN itself."""
+    """Deblocks of stride 1 are a Conv2d [out, in, 1, 1] in place of a ConvTranspose2d [in, out, 1, 1]:
+    USE_CONV_FOR_NO_STRIDE of BaseBEVBackbone (default: as the encoder here), `use_conv_for_no_stride` of SECONDFPN
+    (default: True for pillars and voxels, as in the nuScenes CenterPoint configurations; False for DSVT, as in
+    projects/DSVT)."""
+    prefix: Literal["pts_", ""] | None = None
+    """mmdetection3d: before the modules' names, ``pts_`` (CenterPoint; default for pillars and voxels) or nothing
+    (VoxelNet, and projects/DSVT; default for DSVT)."""
     dynamic_pillars: bool = False
-    """The names of DynamicPillarFeatureNet in place of those of PillarFeatureNet."""
+    """mmdetection3d: the names of DynamicPillarFeatureNet in place of those of PillarFeatureNet."""
 
-    def resolved(self, shapes: Shapes) -> Mmdet3dOptions:
-        """Without None, for an encoder of these names here."""
+    def resolved(self, shapes: Shapes, framework: Framework, conv_here: bool) -> LayoutOptions:
+        """Without None where it matters to the framework.
+
+        Args:
+            shapes: names and shapes of the encoder here.
+            framework: that the options are for.
+            conv_here: deblocks of stride 1 are a Conv2d here.
+        """
+        if framework != "mmdet3d":
+            if self.prefix is not None or self.dynamic_pillars:
+                raise LayoutError(f"{framework}: prefix and dynamic_pillars must be left out, they are mmdetection3d's")
+            return LayoutOptions(stride1_conv=conv_here if self.stride1_conv is None else self.stride1_conv)
         is_dsvt = kind_of(shapes) == "dsvt"
         if is_dsvt and self.dynamic_pillars:
             raise LayoutError(
                 "mmdet3d: dynamic_pillars must be left out for DSVT, whose project has a pillar network of its own"
             )
-        return Mmdet3dOptions(
-            prefix=self.prefix if self.prefix is not None else "" if is_dsvt else "pts_",
+        return LayoutOptions(
             stride1_conv=self.stride1_conv if self.stride1_conv is not None else not is_dsvt,
+            prefix=self.prefix if self.prefix is not None else "" if is_dsvt else "pts_",
             dynamic_pillars=self.dynamic_pillars,
         )
 
@@ -108,24 +120,23 @@ def shapes_of(state: Mapping[str, Tensor]) -> Shapes:
     return {name: tuple(tensor.shape) for name, tensor in state.items()}
 
 
-def layout(shapes: Shapes, to: Framework, options: Mmdet3dOptions | None = None) -> list[Entry]:
+def layout(shapes: Shapes, to: Framework, options: LayoutOptions | None = None, conv_here: bool = False) -> list[Entry]:
     """What becomes of each tensor of an encoder.
 
     Args:
         shapes: names and shapes here.
         to: framework.
-        options: for mmdetection3d.
+        options: of its configuration.
+        conv_here: deblocks of stride 1 are a Conv2d here (`BEVBackboneConfig.conv_for_no_stride`).
 
     Raises:
         LayoutError: the framework has no place for a tensor, or would read it wrongly; the text names it.
     """
+    options = (options or LayoutOptions()).resolved(shapes, to, conv_here)
     rename: Callable[[str], str | None] = _openpcdet_names
-    stride1_conv = False
     folded: dict[str, str] = {}
     if to == "mmdet3d":
-        options = (options or Mmdet3dOptions()).resolved(shapes)
         rename = _mmdet3d_names(shapes, options)
-        stride1_conv = options.stride1_conv is True
         folded = _folded_biases(shapes)
     entries, unknown = [], []
     for ours, shape in shapes.items():
@@ -138,7 +149,7 @@ def layout(shapes: Shapes, to: Framework, options: Mmdet3dOptions | None = None)
         axes: tuple[int, ...] | None = None
         if is_sparse_kernel(ours, shape):
             axes = KRSC_TO_DHWIO
-        elif stride1_conv and is_stride1_deblock(ours, shape):
+        elif options.stride1_conv != conv_here and is_stride1_deblock(ours, shape):
             axes = SWAP_CHANNELS
         entries.append(Entry(ours, theirs, shape, axes, folded.get(ours)))
     if unknown:
@@ -151,14 +162,16 @@ def layout(shapes: Shapes, to: Framework, options: Mmdet3dOptions | None = None)
 
 
 def export_state(
-    state: Mapping[str, Tensor], to: Framework, options: Mmdet3dOptions | None = None
+    state: Mapping[str, Tensor], to: Framework, options: LayoutOptions | None = None, conv_here: bool = False
 ) -> dict[str, Tensor]:
     """An encoder's state dict as a framework loads it: plain dictionary of contiguous tensors, float32 and int64.
+
+    The arguments are those of `layout`.
 
     Raises:
         LayoutError: a tensor has no place in the framework, is of another type than the framework's or not finite.
     """
-    entries = layout(shapes_of(state), to, options)
+    entries = layout(shapes_of(state), to, options, conv_here)
     _require_usable(state)
     exported = {}
     for entry in entries:
@@ -175,8 +188,9 @@ def import_state(
     state: Mapping[str, Tensor],
     shapes: Shapes,
     source: Framework,
-    options: Mmdet3dOptions | None = None,
+    options: LayoutOptions | None = None,
     kernel_order: KernelOrder | None = None,
+    conv_here: bool = False,
 ) -> dict[str, Tensor]:
     """The inverse of `export_state`: the encoder part of a framework's state dict, with the names and layouts here.
 
@@ -184,16 +198,18 @@ def import_state(
         state: encoder part alone.
         shapes: names and shapes of the encoder that it is for.
         source: framework that it comes from.
-        options: for mmdetection3d; a prefix of None is read from the names, ``stride1_conv`` of None from the shapes.
+        options: of its configuration; for mmdetection3d a prefix of None is read from the names, and ``stride1_conv``
+            of None from the shapes.
         kernel_order: of sparse kernels; None reads it from the shapes.
+        conv_here: deblocks of stride 1 are a Conv2d here.
 
     Raises:
         LayoutError: a tensor is missing, left over, of another shape or type, or not finite; the order of the kernels
             cannot be told; or the inverse is not exact, as biases were folded away.
     """
     if source == "mmdet3d":
-        options = _options_of_file(state, shapes, options or Mmdet3dOptions())
-    entries = layout(shapes, source, options)
+        options = _options_of_file(state, shapes, options or LayoutOptions(), conv_here)
+    entries = layout(shapes, source, options, conv_here)
     folded = [entry.minus for entry in entries if entry.minus is not None]
     if folded:
         raise LayoutError(
@@ -383,7 +399,7 @@ def _openpcdet_names(name: str) -> str | None:
     return name if name.split(".")[0] in ENCODER_MODULES else None
 
 
-def _mmdet3d_names(shapes: Shapes, options: Mmdet3dOptions) -> Callable[[str], str | None]:
+def _mmdet3d_names(shapes: Shapes, options: LayoutOptions) -> Callable[[str], str | None]:
     vfe, middle, backbone, neck = (f"{options.prefix}{module}" for module in MMDET3D_MODULES)
     rules: list[tuple[str, Callable[[re.Match[str]], str]]] = [
         (r"backbone_2d\.(deblocks\.\d+\.[01]\..+)", lambda found: f"{neck}.{found[1]}"),
@@ -468,7 +484,9 @@ def _refuse_kernels_turned_wrongly(entries: list[Entry], to: Framework) -> None:
         )
 
 
-def _options_of_file(state: Mapping[str, Tensor], shapes: Shapes, options: Mmdet3dOptions) -> Mmdet3dOptions:
+def _options_of_file(
+    state: Mapping[str, Tensor], shapes: Shapes, options: LayoutOptions, conv_here: bool
+) -> LayoutOptions:
     prefix, dynamic, conv = options.prefix, options.dynamic_pillars, options.stride1_conv
     if prefix is None:
         prefix = "pts_" if any(name.startswith("pts_") for name in state) else ""
@@ -479,14 +497,14 @@ def _options_of_file(state: Mapping[str, Tensor], shapes: Shapes, options: Mmdet
         for name, shape in deblocks.items():
             theirs = state.get(prefix + "neck." + name.removeprefix("backbone_2d."))
             if theirs is not None and shape[0] != shape[1]:
-                said.add(tuple(theirs.shape) != shape)
+                said.add((tuple(theirs.shape) != shape) != conv_here)
         if len(said) != 1 and deblocks:
             raise LayoutError(
                 "mmdet3d: deblocks of stride 1 must show by their shapes whether they are Conv2d or ConvTranspose2d, "
                 "got as many channels in as out; say it with --stride1-deblock"
             )
         conv = said.pop() if said else False
-    return Mmdet3dOptions(prefix=prefix, stride1_conv=conv, dynamic_pillars=dynamic)
+    return LayoutOptions(prefix=prefix, stride1_conv=conv, dynamic_pillars=dynamic)
 
 
 def _require_usable(state: Mapping[str, Tensor]) -> None:

@@ -177,7 +177,7 @@ def export(arguments: list[str]) -> None:
         parser.add_argument(
             "--parts", default=",".join(ENCODER_MODULES), help="modules to write, with commas; all by default"
         )
-        _add_mmdet3d_options(parser)
+        _add_layout_options(parser)
 
     options, config = _options_of_run(
         "pred export",
@@ -194,7 +194,7 @@ def export(arguments: list[str]) -> None:
         checkpoint=options.checkpoint,
         recalibrate_scans=None if options.no_recalibrate else options.recalibrate_scans,
         parts=options.parts.split(","),
-        options=_mmdet3d_options(options),
+        options=_layout_options(options),
     )
 
 
@@ -238,12 +238,12 @@ def import_weights(arguments: list[str]) -> None:
         default=None,
         help="sparse kernels are (out, z, y, x, in) or (z, y, x, in, out), where their shapes do not tell",
     )
-    _add_mmdet3d_options(parser)
+    _add_layout_options(parser)
     parsed = parser.parse_args(arguments)
     from pred.export import import_encoder
 
     config = build(parser, PretrainConfig, parsed)
-    import_encoder(config, parsed.file, parsed.out, _mmdet3d_options(parsed), parsed.kernel_order)
+    import_encoder(config, parsed.file, parsed.out, _layout_options(parsed), parsed.kernel_order)
 
 
 def world(arguments: list[str]) -> None:
@@ -427,7 +427,7 @@ def _options_of_run(
     return parsed, build(parser, PretrainConfig, parsed)
 
 
-def _add_mmdet3d_options(parser: Any) -> None:
+def _add_layout_options(parser: Any) -> None:
     parser.add_argument(
         "--mmdet3d-prefix",
         choices=("pts_", "none"),
@@ -438,19 +438,20 @@ def _add_mmdet3d_options(parser: Any) -> None:
         "--stride1-deblock",
         choices=("conv", "deconv"),
         default=None,
-        help="mmdetection3d: conv where the neck has use_conv_for_no_stride=True; deconv by default for DSVT",
+        help="conv where the framework's 2D backbone or neck has use_conv_for_no_stride; by default as in the encoder "
+        "here (mmdetection3d: conv, deconv for DSVT)",
     )
     parser.add_argument(
         "--dynamic-pillars", action="store_true", help="mmdetection3d: the names of DynamicPillarFeatureNet"
     )
 
 
-def _mmdet3d_options(options: Any) -> Any:
-    from pred.checkpoint_layouts import Mmdet3dOptions
+def _layout_options(options: Any) -> Any:
+    from pred.checkpoint_layouts import LayoutOptions
 
     if (options.mmdet3d_prefix, options.stride1_deblock, options.dynamic_pillars) == (None, None, False):
         return None
-    return Mmdet3dOptions(
+    return LayoutOptions(
         prefix={None: None, "none": "", "pts_": "pts_"}[options.mmdet3d_prefix],
         stride1_conv={None: None, "conv": True, "deconv": False}[options.stride1_deblock],
         dynamic_pillars=options.dynamic_pillars,

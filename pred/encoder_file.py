@@ -30,11 +30,11 @@ from pred.checkpoint_layouts import (
     Framework,
     KernelOrder,
     LayoutError,
-    Mmdet3dOptions,
+    LayoutOptions,
     export_state,
     framework_of,
     import_state,
-    kind_of,
+    is_stride1_deblock,
     shapes_of,
 )
 from pred.config import plain
@@ -43,14 +43,13 @@ from pred.run_folder import environment
 if TYPE_CHECKING:
     from pred.pretrain import PretrainConfig
 
-CHANNELS = {
+CHANNEL_UNITS = {
     "x": "metres, LiDAR frame of the data set",
     "y": "metres, LiDAR frame of the data set",
     "z": "metres, LiDAR frame of the data set",
     "intensity": "as stored in the data set, not scaled",
     "age": "seconds behind the keyframe, 0 for the keyframe's own points",
 }
-"""Channels of a point in their order, and their units; an encoder of 4 channels has the first 4."""
 
 FACTS = "pred"
 """Key of a file under which the facts stand."""
@@ -77,6 +76,14 @@ class WeightsFile:
     facts: dict[str, Any]
 
 
+def has_conv_for_no_stride(encoder: nn.Module) -> bool:
+    """Whether the 2D backbone has a Conv2d where its resolution stays (`BEVBackboneConfig.conv_for_no_stride`)."""
+    return any(
+        isinstance(layer, nn.Conv2d) and is_stride1_deblock(f"{name}.weight", tuple(layer.weight.shape))
+        for name, layer in encoder.named_modules()
+    )
+
+
 def sidecar(path: Path) -> Path:
     """Where the facts of a file stand."""
     return path.with_name(f"{path.name}.json")
@@ -93,18 +100,16 @@ def encoder_facts(
         step: steps it was trained for.
         batch_norm: where its running statistics come from.
     """
-    shapes = shapes_of(encoder.state_dict())
-    channels = list(CHANNELS)[: point_channels(shapes)]
     data = config.data
     return {
         "encoder": type(encoder).__name__,
-        "encoder_kind": kind_of(shapes),
+        "encoder_kind": config.encoder.kind,
         "encoder_config": plain(config.encoder),
         "dataset": data.dataset,
         "split": data.split,
         "point_range_m": [float(value) for value in config.point_range],
         "voxel_size_m": [float(size) for size in encoder.voxel_size],  # type: ignore[union-attr]
-        "point_channels": {name: CHANNELS[name] for name in channels},
+        "point_channels": {name: CHANNEL_UNITS[name.split("_")[0]] for name in data.point_channels},
         "time_unit": "s",
         "sweeps": data.sweeps,
         "mask_ratio": data.mask_ratio,
@@ -115,13 +120,6 @@ def encoder_facts(
         "versions": environment()["versions"],
         "caveats": [*_caveats(config, batch_norm)],
     }
-
-
-def point_channels(shapes: Mapping[str, tuple[int, ...]]) -> int:
-    """Raw channels per point that an encoder of these shapes (names and layouts here) is for."""
-    if "vfe.pfn_layers.0.linear.weight" in shapes:
-        return shapes["vfe.pfn_layers.0.linear.weight"][1] - 6
-    return shapes["backbone_3d.conv_input.0.weight"][-1]
 
 
 def _caveats(config: PretrainConfig, batch_norm: Mapping[str, Any]) -> list[str]:
@@ -136,20 +134,20 @@ def _caveats(config: PretrainConfig, batch_norm: Mapping[str, Any]) -> list[str]
 
 def write_encoder(
     path: Path,
-    state: Mapping[str, Tensor],
+    encoder: nn.Module,
     facts: Mapping[str, Any],
     to: Framework = "openpcdet",
-    options: Mmdet3dOptions | None = None,
+    options: LayoutOptions | None = None,
     parts: Collection[str] = ENCODER_MODULES,
 ) -> dict[str, Any]:
     """Write an encoder's weights for a framework, and the sidecar; either is replaced at once or not at all.
 
     Args:
         path: the file.
-        state: state dict of the encoder.
+        encoder: whose weights are written.
         facts: see `encoder_facts`.
         to: framework.
-        options: for mmdetection3d.
+        options: of its configuration.
         parts: modules that are written.
 
     Returns:
@@ -161,11 +159,12 @@ def write_encoder(
     """
     if not path.parent.is_dir():
         raise CheckpointError(f"{path}: folder must exist, got none")
+    state, conv_here = encoder.state_dict(), has_conv_for_no_stride(encoder)
     unknown = sorted({*parts} - {name.split(".")[0] for name in state})
     if unknown and {*parts} != {*ENCODER_MODULES}:
         raise LayoutError(f"parts must be modules of the encoder, got {', '.join(unknown)}")
     chosen = {name: tensor for name, tensor in state.items() if name.split(".")[0] in parts}
-    exported = export_state(chosen, to, options)
+    exported = export_state(chosen, to, options, conv_here)
     layout: dict[str, Any] = {
         "framework": to,
         "key": WRAPPERS[to],
@@ -175,9 +174,8 @@ def write_encoder(
         "modules": dict(Counter(name.split(".")[0] for name in exported)),
         "num_tensors": len(exported),
         "num_tensors_here": len(chosen),
+        "options": asdict((options or LayoutOptions()).resolved(shapes_of(chosen), to, conv_here)),
     }
-    if to == "mmdet3d":
-        layout["mmdet3d"] = asdict((options or Mmdet3dOptions()).resolved(shapes_of(chosen)))
     content = {**facts, "layout": layout}
     # While the file is replaced there is none of the old facts beside it.
     sidecar(path).unlink(missing_ok=True)
@@ -229,7 +227,7 @@ def read_weights(path: Path) -> WeightsFile:
 def load_encoder(
     encoder: nn.Module,
     path: Path,
-    options: Mmdet3dOptions | None = None,
+    options: LayoutOptions | None = None,
     kernel_order: KernelOrder | None = None,
 ) -> dict[str, Any]:
     """Give an encoder the weights in a checkpoint of OpenPCDet, DSVT, mmdetection3d or this package, all or none.
@@ -239,7 +237,7 @@ def load_encoder(
     Args:
         encoder: gets the weights.
         path: the checkpoint.
-        options: for mmdetection3d, where names and shapes do not tell; see `Mmdet3dOptions`.
+        options: of the framework's configuration, where names and shapes do not tell; see `LayoutOptions`.
         kernel_order: of the sparse kernels, where shapes do not tell.
 
     Returns:
@@ -259,7 +257,14 @@ def load_encoder(
     heads = {name for name in file.state if name.split(".")[0] in HEADS}
     state = {name: tensor for name, tensor in file.state.items() if name not in heads}
     try:
-        imported = import_state(state, shapes_of(encoder.state_dict()), framework, options, kernel_order)
+        imported = import_state(
+            state,
+            shapes_of(encoder.state_dict()),
+            framework,
+            options,
+            kernel_order,
+            has_conv_for_no_stride(encoder),
+        )
     except LayoutError as error:
         raise CheckpointError(f"{path}: {error}") from None
     encoder.load_state_dict(imported)
@@ -273,9 +278,9 @@ def load_encoder(
     }
 
 
-def _written_options(layout: Mapping[str, Any]) -> Mmdet3dOptions | None:
-    written = layout.get("mmdet3d")
-    return Mmdet3dOptions(**written) if isinstance(written, dict) else None
+def _written_options(layout: Mapping[str, Any]) -> LayoutOptions | None:
+    written = layout.get("options")
+    return LayoutOptions(**written) if isinstance(written, dict) else None
 
 
 def _require_sidecar(path: Path) -> None:

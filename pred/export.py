@@ -19,11 +19,11 @@ from torch import Tensor
 
 from pred import __version__
 from pred.checkpoint import load_tensors, save_checkpoint
-from pred.checkpoint_layouts import ENCODER_MODULES, Framework, KernelOrder, Mmdet3dOptions, layout, shapes_of
+from pred.checkpoint_layouts import ENCODER_MODULES, Framework, KernelOrder, LayoutOptions, layout, shapes_of
 from pred.config import plain, to_yaml
 from pred.data.batch import build_source
 from pred.data.frame import FrameError
-from pred.encoder_file import encoder_facts, load_encoder, sidecar, write_encoder
+from pred.encoder_file import encoder_facts, has_conv_for_no_stride, load_encoder, sidecar, write_encoder
 from pred.evaluate import SpreadFrames, load_frames
 from pred.evaluate_probe import whole_scan
 from pred.models.pretrainer import Pretrainer
@@ -42,7 +42,7 @@ def export(
     checkpoint: Path | None = None,
     recalibrate_scans: int | None = RECALIBRATION_SCANS,
     parts: Collection[str] = ENCODER_MODULES,
-    options: Mmdet3dOptions | None = None,
+    options: LayoutOptions | None = None,
 ) -> dict[str, Any]:
     """Write the encoder of a run as a framework loads it, and FILE.json beside it.
 
@@ -55,7 +55,7 @@ def export(
         recalibrate_scans: whole scans, spread evenly over the data set, whose average makes the statistics of batch
             normalisation; None keeps those of the checkpoint.
         parts: modules that are written.
-        options: for mmdetection3d.
+        options: of the framework's configuration.
 
     Returns:
         What FILE.json holds.
@@ -69,7 +69,8 @@ def export(
     folder = RunFolder(run)
     folder.require()
     model, checkpoint = load_model(config, folder, checkpoint)
-    layout(_chosen(model, parts), to, options)  # refuses before the long work
+    # What the framework has no place for is refused before the long work.
+    layout(_chosen(model, parts), to, options, has_conv_for_no_stride(model.encoder))
     state = load_tensors(checkpoint)
     batch_norm: dict[str, Any] = state.get("batch_norm", {"source": "checkpoint", "masked": True})
     if recalibrate_scans is not None:
@@ -78,7 +79,7 @@ def export(
     facts["checkpoint"] = checkpoint.name
     if "imported" in state:
         facts["imported"] = state["imported"]
-    content = write_encoder(out, model.encoder.state_dict(), facts, to, options, parts)
+    content = write_encoder(out, model.encoder, facts, to, options, parts)
     layout_facts = content["layout"]
     print(f"wrote {out} and {sidecar(out).name}: {layout_facts['num_tensors']} tensors for {to}")
     for module, count in layout_facts["modules"].items():
@@ -138,7 +139,7 @@ def import_encoder(
     config: PretrainConfig,
     file: Path,
     out: Path,
-    options: Mmdet3dOptions | None = None,
+    options: LayoutOptions | None = None,
     kernel_order: KernelOrder | None = None,
 ) -> dict[str, Any]:
     """Make a run folder of the encoder in a checkpoint of OpenPCDet, DSVT, mmdetection3d or this package.
@@ -150,7 +151,7 @@ def import_encoder(
         config: names the encoder.
         file: the checkpoint.
         out: run folder, which must be new.
-        options: for mmdetection3d, where names and shapes do not tell.
+        options: of the framework's configuration, where names and shapes do not tell.
         kernel_order: of the sparse kernels, where shapes do not tell.
 
     Returns:
@@ -176,7 +177,7 @@ def import_encoder(
     }
     save_checkpoint(folder.checkpoints, 0, state, keep_last=1)
     facts = encoder_facts(config, model.encoder, 0, batch_norm) | {"imported": imported}
-    write_encoder(folder.encoder, model.encoder.state_dict(), facts)
+    write_encoder(folder.encoder, model.encoder, facts)
     print(f"imported {imported['num_tensors']} tensors of {imported['framework']} from {file} into {out}")
     if imported["left_out"]:
         print(f"  left out: {', '.join(imported['left_out'])}")

@@ -39,7 +39,7 @@ from pred.data.batch import Batch, DataConfig, PointRange, TrainingBatches, buil
 from pred.data.frame import NUM_CLASSES, FrameSource
 from pred.encoder_file import encoder_facts, load_encoder, write_encoder
 from pred.losses import LossConfig
-from pred.models.encoders.pillars import PillarEncoderConfig
+from pred.models.encoders import EncoderConfig
 from pred.models.field import FieldConfig
 from pred.models.pretrainer import Pretrainer, PretrainOutput
 from pred.models.renderer import RendererConfig
@@ -59,6 +59,9 @@ DIGEST_FRAMES = 1000
 
 RECALIBRATION_BATCHES = 16
 """Batches whose average makes the final batch normalisation statistics; 4 and 64 were found to do as well."""
+
+ATTENTION_IN_PROJ = ("in_proj_weight", "in_proj_bias")
+"""Parameters of attention that project to queries, keys and values, as `torch.nn.MultiheadAttention` names them."""
 
 
 @dataclass
@@ -84,12 +87,15 @@ class TrainConfig:
     """AdamW's beta1: the second value at the ends of the schedule, the first where the learning rate peaks."""
     beta2: float = 0.99
     """AdamW's beta2."""
+    attention_in_proj: Literal["train", "freeze"] = "train"
+    """freeze: query, key and value projections of attention stay at their initial values, as OpenPCDet's and DSVT's
+    adam_onecycle leaves them (docs/optimiser.md)."""
     grad_clip: float = 35.0
     """Largest norm of the gradient of all parameters together."""
     seed: int = 0
     """Of the initial weights and of all sampling."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
-    """bf16-mixed: the convolutions of the encoder's 2D backbone in bfloat16, all else in float32."""
+    """bf16-mixed: the encoder's backbones in bfloat16, all else in float32."""
     deterministic: bool = True
     """Use only algorithms that repeat bit for bit (needed for an exact resume on CUDA)."""
     accelerator: str = "auto"
@@ -132,8 +138,8 @@ class PretrainConfig:
     """Range box (x_min, y_min, z_min, x_max, y_max, z_max), metres, LiDAR frame."""
     data: DataConfig = dataclasses.field(default_factory=DataConfig)
     """What is read, what is hidden from the encoder, and how many rays are drawn."""
-    encoder: PillarEncoderConfig = dataclasses.field(default_factory=PillarEncoderConfig)
-    """Sizes of the pillar encoder."""
+    encoder: EncoderConfig = dataclasses.field(default_factory=EncoderConfig)
+    """Family and sizes of the encoder."""
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     """Sizes of the decoder from BEV features to signed distance and semantics."""
     renderer: RendererConfig = dataclasses.field(default_factory=RendererConfig)
@@ -297,7 +303,7 @@ def pretrain(config: PretrainConfig, resume: bool = False) -> Path:
         if fabric.is_global_zero:
             batch_norm = {"source": "training batches", "masked": True, "batches": RECALIBRATION_BATCHES}
             encoder = model.module.encoder
-            write_encoder(folder.encoder, encoder.state_dict(), encoder_facts(config, encoder, step, batch_norm))
+            write_encoder(folder.encoder, encoder, encoder_facts(config, encoder, step, batch_norm))
         progress.message(
             f"weights: {folder.encoder}; for a detector: pred export {folder.path} --to FRAMEWORK --out FILE"
         )
@@ -329,13 +335,32 @@ def build_model(config: PretrainConfig) -> Pretrainer:
     """The network with its initial weights, a function of the configuration and its seed alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed_of(config.train.seed, "initial weights"))
-        return Pretrainer(config.encoder, config.field, config.renderer, config.loss, config.point_range)
+        return Pretrainer(
+            config.encoder,
+            config.field,
+            config.renderer,
+            config.loss,
+            config.point_range,
+            len(config.data.point_channels),
+        )
 
 
 def build_optimizer(model: torch.nn.Module, train: TrainConfig) -> AdamW:
-    """AdamW over all parameters."""
+    """AdamW over all parameters, or over all but the frozen: ``attention_in_proj="freeze"`` takes the gradient from the
+    parameters in `ATTENTION_IN_PROJ`, so they are neither moved nor decayed, nor part of the clipped norm.
+
+    Raises:
+        ValueError: there is nothing to freeze.
+    """
+    if train.attention_in_proj == "freeze":
+        frozen = [parameter for name, parameter in model.named_parameters() if name.split(".")[-1] in ATTENTION_IN_PROJ]
+        if not frozen:
+            raise ValueError("train.attention_in_proj must be train for a model without attention, got freeze")
+        for parameter in frozen:
+            parameter.requires_grad_(False)
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     betas = (train.momentum_range[1], train.beta2)
-    return AdamW(model.parameters(), lr=train.lr, betas=betas, weight_decay=train.weight_decay, fused=True)
+    return AdamW(parameters, lr=train.lr, betas=betas, weight_decay=train.weight_decay, fused=True)
 
 
 def load_model(config: PretrainConfig, folder: RunFolder, checkpoint: Path | None = None) -> tuple[Pretrainer, Path]:

@@ -11,17 +11,20 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from benchmarks.plain_dsvt import PlainDSVT
 from pred.checkpoint_layouts import (
     FRAMEWORKS,
     LayoutError,
-    Mmdet3dOptions,
+    LayoutOptions,
     export_state,
     import_state,
     layout,
     shapes_of,
 )
 from pred.export_check import specs_of
-from pred.models.encoders.pillars import PillarEncoder, PillarEncoderConfig
+from pred.models.encoders import BEVBackboneConfig, DSVTConfig, Encoder, EncoderConfig, PillarConfig
+from pred.models.encoders.dsvt import DSVT
+from pred.models.encoders.voxels import HeightCompression, VoxelBackBone8x, VoxelResBackBone8x
 from tests.framework_layouts import (
     MODELS,
     Mmdet3dBevBackbone,
@@ -119,7 +122,7 @@ def test_voxel_backbones_compute_the_same_in_openpcdet_and_mmdetection3d(model: 
 def test_2d_backbones_compute_the_same_in_openpcdet_and_mmdetection3d(model: str, stride1_conv: bool) -> None:
     state, sizes = encoder_state(model), BACKBONES_2D[model]
     prefix = "" if model.startswith("dsvt") else "pts_"
-    exported = export_state(state, "mmdet3d", Mmdet3dOptions(stride1_conv=stride1_conv))
+    exported = export_state(state, "mmdet3d", LayoutOptions(stride1_conv=stride1_conv))
     openpcdet = OpenPCDetBevBackbone(**sizes)
     load_as_openpcdet(openpcdet, part(export_state(state, "openpcdet"), "backbone_2d"))
     mmdet3d = Mmdet3dBevBackbone(prefix, **sizes, stride1_conv=stride1_conv)
@@ -136,7 +139,7 @@ def test_2d_backbones_compute_the_same_in_openpcdet_and_mmdetection3d(model: str
 def test_a_deblock_that_is_not_transposed_computes_something_else() -> None:
     """128 channels in and out: no shape tells, so that a wrong option would go unnoticed."""
     state, sizes = encoder_state("pcdet_nus_dynpp"), BACKBONES_2D["pcdet_nus_dynpp"]
-    right, wrong = (export_state(state, "mmdet3d", Mmdet3dOptions(stride1_conv=conv)) for conv in (True, False))
+    right, wrong = (export_state(state, "mmdet3d", LayoutOptions(stride1_conv=conv)) for conv in (True, False))
     assert shapes_of(right) == shapes_of(wrong)
     x = torch.randn(1, 64, 8, 8, generator=torch.Generator().manual_seed(2))
     outputs = []
@@ -151,7 +154,7 @@ def test_a_deblock_that_is_not_transposed_computes_something_else() -> None:
 @pytest.mark.parametrize("dynamic", [False, True])
 def test_pillar_networks_have_the_names_of_mmdetection3d(dynamic: bool) -> None:
     state = encoder_state("pcdet_nus_dynpp")
-    exported = export_state(state, "mmdet3d", Mmdet3dOptions(dynamic_pillars=dynamic))
+    exported = export_state(state, "mmdet3d", LayoutOptions(dynamic_pillars=dynamic))
     layers = nn.ModuleList()
     for before, after in ((11, 32), (64, 64)):
         linear, norm = nn.Linear(before, after, bias=False), nn.BatchNorm1d(after, eps=1e-3)
@@ -189,6 +192,7 @@ class PlainPillars(nn.Module):
             own = points[inside]
             features = torch.cat([own, own[:, :3] - own[:, :3].mean(0), own[:, :3] - centres[inside]], dim=1)
             for number, layer in enumerate(self.pfn_layers, start=1):
+                assert isinstance(layer, nn.ModuleDict)
                 linear, norm = layer.values()
                 features = F.relu(norm(linear(features)))
                 largest = features.max(dim=0).values
@@ -201,22 +205,27 @@ class PlainPillars(nn.Module):
         return canvas
 
 
+@pytest.mark.parametrize("conv_here", [False, True])
 @pytest.mark.parametrize("to", ["openpcdet", "dsvt", "mmdet3d", "mmdet3d dynamic"])
-def test_pillar_encoder_computes_the_same_in_each_framework(to: str, backend: str) -> None:
-    config = PillarEncoderConfig(
-        pillar_size=(0.8, 0.8), vfe_filters=[16, 24], layer_nums=[1, 2], layer_strides=[2, 2], num_filters=[16, 32],
-        upsample_strides=[1, 2], num_upsample_filters=[24, 16],
+def test_pillar_encoder_computes_the_same_in_each_framework(to: str, conv_here: bool, backend: str) -> None:
+    config = EncoderConfig(
+        pillars=PillarConfig(pillar_size=(0.8, 0.8), vfe_filters=[16, 24]),
+        backbone_2d=BEVBackboneConfig(
+            layer_nums=[1, 2], layer_strides=[2, 2], num_filters=[16, 32], upsample_strides=[1, 2],
+            num_upsample_filters=[24, 16], conv_for_no_stride=conv_here,
+        ),
     )  # fmt: skip
     point_range = (-6.4, -9.6, -3.0, 6.4, 9.6, 3.0)
     torch.manual_seed(0)
-    encoder = PillarEncoder(config, point_range).eval()
+    encoder = Encoder(config, point_range).eval()
     specs = specs_of(encoder.state_dict())
     encoder.load_state_dict(random_state(specs))
     low, high = torch.tensor(point_range[:3]), torch.tensor(point_range[3:])
     points = torch.rand(300, 5) * torch.cat([high - low, torch.tensor([255.0, 0.5])]) + F.pad(low, (0, 2))
     framework: Any = to.split()[0]
     dynamic = to.endswith("dynamic")
-    exported = export_state(encoder.state_dict(), framework, Mmdet3dOptions(dynamic_pillars=dynamic))
+    options = LayoutOptions(dynamic_pillars=dynamic, stride1_conv=True if framework == "mmdet3d" else False)
+    exported = export_state(encoder.state_dict(), framework, options, conv_here)
     prefix = "pts_voxel_encoder." if framework == "mmdet3d" else "vfe."
     pillars = PlainPillars(("0", "1") if dynamic else ("linear", "norm"), [(11, 8), (16, 24)])
     pillars.load_state_dict({name.removeprefix(prefix): x for name, x in exported.items() if name.startswith(prefix)})
@@ -236,6 +245,49 @@ def test_pillar_encoder_computes_the_same_in_each_framework(to: str, backend: st
         actual = backbone.eval()(canvas)
     assert expected.shape == (1, 40, 12, 8) and expected.std() > 0.1
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("variant", ["plain", "residual", "residual with biases"])
+def test_voxel_backbones_compute_the_same_in_each_framework(variant: str, native: None) -> None:
+    biases = variant.endswith("biases")
+    backbone: nn.Module
+    if variant == "plain":
+        backbone = VoxelBackBone8x(4, (40, 12, 12))
+    else:
+        backbone = VoxelResBackBone8x(4, (40, 12, 12), biases)
+    backbone.load_state_dict(random_state(specs_of(backbone.state_dict())))
+    state = {f"backbone_3d.{name}": value for name, value in backbone.state_dict().items()}
+    openpcdet = OpenPCDetVoxelBackbone(4, variant != "plain", biases)
+    load_as_openpcdet(openpcdet, part(export_state(state, "openpcdet"), "backbone_3d"))
+    mmdet3d = Mmdet3dSparseEncoder(4, variant != "plain")
+    mmdet3d.load_state_dict(part(export_state(state, "mmdet3d"), "pts_middle_encoder"))
+    features, active = some_sites(4)
+    coords = active[:, 0].nonzero()
+    values = features.permute(0, 2, 3, 4, 1)[active[:, 0] > 0].float()
+    with torch.no_grad():
+        actual = HeightCompression()(backbone.eval()(values, coords, 1))
+        for network in (openpcdet, mmdet3d):
+            expected = network.double().eval()((features, active))
+            assert expected.shape == (1, 256, 2, 2) and expected.std() > 0.05
+            torch.testing.assert_close(actual.double(), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("to", FRAMEWORKS)
+def test_dsvt_computes_the_same_in_each_framework(to: Any) -> None:
+    """Against DSVT as published, under the names of the framework."""
+    config = DSVTConfig(d_model=16, num_heads=2, ffn_channels=24, num_blocks=2, set_size=7, window=(4, 4))
+    backbone = DSVT(config, (12, 16))
+    backbone.load_state_dict(random_state(specs_of(backbone.state_dict())))
+    state = {f"backbone_3d.{name}": value for name, value in backbone.state_dict().items()}
+    published = PlainDSVT(config, (12, 16))
+    published.load_state_dict(part(export_state(state, to), "middle_encoder" if to == "mmdet3d" else "backbone_3d"))
+    cells = torch.randperm(12 * 16, generator=torch.Generator().manual_seed(0))[:90].sort().values
+    coords = torch.stack([torch.zeros_like(cells), torch.zeros_like(cells), cells // 16, cells % 16], dim=1)
+    features = torch.randn(90, 16, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        expected, actual = (network.eval()(features, coords, 1) for network in (published, backbone))
+    assert expected.std() > 0.1
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
 
 
 # Tables
@@ -278,14 +330,15 @@ def test_names_and_shapes_of_mmdetection3d_by_hand() -> None:
 @pytest.mark.parametrize("model", MODELS)
 def test_a_round_trip_gives_every_bit_back(model: str, to: Any) -> None:
     state = encoder_state(model)
-    exported = export_state(state, to)
+    conv_here = model == "pcdet_nus_tf"
+    exported = export_state(state, to, conv_here=conv_here)
     assert all(type(name) is str and value.is_contiguous() for name, value in exported.items())
     if to == "mmdet3d" and model in BIASED:
         with pytest.raises(LayoutError, match=r"residual convolutions must have no bias.*conv1\.0\.conv1\.bias"):
             import_state(exported, shapes_of(state), to)
         return
-    options = Mmdet3dOptions(stride1_conv=not model.startswith("dsvt") and "dsvt" not in model)
-    back = import_state(exported, shapes_of(state), to, options)
+    options = LayoutOptions(stride1_conv=conv_here if to != "mmdet3d" else "dsvt" not in model)
+    back = import_state(exported, shapes_of(state), to, options, conv_here=conv_here)
     assert back.keys() == state.keys()
     for name, value in state.items():
         assert torch.equal(back[name], value) and back[name].dtype == value.dtype, name
@@ -359,7 +412,7 @@ def test_kernels_that_openpcdet_would_turn_wrongly_are_refused() -> None:
 def test_the_order_of_kernels_is_told_by_shape_or_asked_for() -> None:
     cube = {"backbone_3d.conv_out.0.weight": torch.randn(3, 3, 3, 3, 3)}
     named = {"pts_middle_encoder.conv_out.0.weight": cube["backbone_3d.conv_out.0.weight"]}
-    options = Mmdet3dOptions(prefix="pts_", stride1_conv=False)
+    options = LayoutOptions(prefix="pts_", stride1_conv=False)
     with pytest.raises(LayoutError, match=r"got none that does; say it with --kernel-order"):
         import_state(named, shapes_of(cube), "mmdet3d", options)
     kept = import_state(named, shapes_of(cube), "mmdet3d", options, "krsc")
@@ -386,9 +439,46 @@ def test_deblocks_of_mmdetection3d_are_told_by_shape_or_asked_for() -> None:
         import_state(export_state(square, "mmdet3d"), shapes_of(square), "mmdet3d")
     oblong = encoder_state("pcdet_once_pp")
     for conv in (True, False):
-        exported = export_state(oblong, "mmdet3d", Mmdet3dOptions(stride1_conv=conv, dynamic_pillars=conv))
+        exported = export_state(oblong, "mmdet3d", LayoutOptions(stride1_conv=conv, dynamic_pillars=conv))
         back = import_state(exported, shapes_of(oblong), "mmdet3d")
         assert all(torch.equal(back[name], value) for name, value in oblong.items())
+
+
+def test_deblocks_are_turned_where_the_configurations_differ() -> None:
+    """TransFusion's 2D backbone has a Conv2d at stride 1, SECOND's a ConvTranspose2d."""
+    name = "backbone_2d.deblocks.0.0.weight"
+    state = encoder_state("pcdet_nus_tf")
+    kernel = state[name]
+    assert kernel.shape == (256, 128, 1, 1)
+    for to, stride1_conv, expected in (
+        ("openpcdet", None, kernel),
+        ("openpcdet", True, kernel),
+        ("openpcdet", False, kernel.transpose(0, 1)),
+        ("mmdet3d", None, kernel),
+        ("mmdet3d", False, kernel.transpose(0, 1)),
+    ):
+        framework: Any = to
+        options = LayoutOptions(stride1_conv=stride1_conv)
+        exported = export_state(state, framework, options, conv_here=True)
+        theirs = name if to == "openpcdet" else "pts_neck.deblocks.0.0.weight"
+        assert torch.equal(exported[theirs], expected)
+        # From mmdetection3d the shapes tell.
+        back = import_state(
+            exported, shapes_of(state), framework, options if to == "openpcdet" else None, conv_here=True
+        )
+        assert torch.equal(back[name], kernel)
+    with pytest.raises(LayoutError, match=r"ConvTranspose2d \[in, out, k, k\] in place of a Conv2d"):
+        turned = export_state(state, "openpcdet", LayoutOptions(stride1_conv=False), conv_here=True)
+        import_state(turned, shapes_of(state), "openpcdet", conv_here=True)
+
+
+def test_options_of_another_framework_are_refused() -> None:
+    state = encoder_state("dsvt_nus")
+    for options in (LayoutOptions(prefix="pts_"), LayoutOptions(dynamic_pillars=True)):
+        with pytest.raises(LayoutError, match="prefix and dynamic_pillars must be left out"):
+            export_state(state, "dsvt", options)
+    with pytest.raises(LayoutError, match="must be left out for DSVT"):
+        export_state(state, "mmdet3d", LayoutOptions(dynamic_pillars=True))
 
 
 def test_half_precision_is_widened() -> None:

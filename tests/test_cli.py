@@ -123,16 +123,16 @@ def test_files_and_command_line_override_in_order(tmp_path: Path) -> None:
 
 def test_values_have_the_types_of_their_fields() -> None:
     got = parse(
-        "--encoder.pillar_size",
+        "--encoder.pillars.pillar_size",
         "[0.4, 0.4]",
-        "--encoder.layer_nums",
+        "--encoder.backbone_2d.layer_nums",
         "[1, 2, 3]",
         "--train.lr",
         "1e-3",
         "--data.root",
         "x",
     )
-    assert got.encoder.pillar_size == (0.4, 0.4) and got.encoder.layer_nums == [1, 2, 3]
+    assert got.encoder.pillars.pillar_size == (0.4, 0.4) and got.encoder.backbone_2d.layer_nums == [1, 2, 3]
     assert got.train.lr == 1e-3 and got.data.root == "x" and got.train.steps is None
 
 
@@ -142,7 +142,7 @@ def test_values_have_the_types_of_their_fields() -> None:
         (["--data.rot", "x"], "did you mean --data.root?"),
         (["--zzz", "1"], None),
         (["--lr", "1"], "did you mean --train.lr?"),
-        (["--encoder.pilar_size=[1,1]"], "did you mean --encoder.pillar_size?"),
+        (["--encoder.pillars.pilar_size=[1,1]"], "did you mean --encoder.pillars.pillar_size?"),
     ],
 )
 def test_unknown_option_names_the_nearest(
@@ -158,7 +158,7 @@ def test_unknown_option_names_the_nearest(
     ("content", "key", "hint"),
     [
         ("data: {roots: x}", "roots", "did you mean data.root?"),
-        ("encoder: {pilar_size: [1, 1]}", "pilar_size", "did you mean encoder.pillar_size?"),
+        ("encoder: {pillars: {pilar_size: [1, 1]}}", "pilar_size", "did you mean encoder.pillars.pillar_size?"),
         ("trains: {lr: 1}", "trains", "did you mean train"),
         ("zzz: 1", "zzz", None),
     ],
@@ -248,9 +248,11 @@ def test_config_files_hold_differences_only(name: str) -> None:
 
 
 SIZES = {
-    "data.batch_size", "data.semantic_rays_per_camera", "data.depth_rays", "encoder.pillar_size", "encoder.vfe_filters",
-    "encoder.layer_nums", "encoder.layer_strides", "encoder.num_filters", "encoder.upsample_strides",
-    "encoder.num_upsample_filters", "field.hidden", "renderer.coarse_samples", "renderer.fine_samples", "train.steps",
+    "data.batch_size", "data.semantic_rays_per_camera", "data.depth_rays", "encoder.pillars.pillar_size",
+    "encoder.pillars.vfe_filters", "encoder.backbone_2d.layer_nums", "encoder.backbone_2d.layer_strides",
+    "encoder.backbone_2d.num_filters", "encoder.backbone_2d.upsample_strides",
+    "encoder.backbone_2d.num_upsample_filters", "field.hidden",
+    "renderer.coarse_samples", "renderer.fine_samples", "train.steps",
 }  # fmt: skip
 
 

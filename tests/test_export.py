@@ -12,24 +12,26 @@ import re
 import signal
 import time
 from collections import OrderedDict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from pred import cli
 from pred.checkpoint import CheckpointError, list_checkpoints, load_tensors, save_tensors
-from pred.checkpoint_layouts import LayoutError, export_state, import_state, shapes_of
+from pred.checkpoint_layouts import FRAMEWORKS, LayoutError, export_state, import_state, shapes_of
 from pred.data.batch import build_source
 from pred.data.frame import Frame
 from pred.encoder_file import load_encoder, read_weights, sidecar, write_encoder
 from pred.evaluate_probe import whole_scan
 from pred.export import export, import_encoder
 from pred.export_check import Comparison, Spec, compare, read_specs, specs_of
-from pred.models.encoders.pillars import PointLayer
+from pred.models.encoders import BEVBackboneConfig, DSVTConfig, Encoder, EncoderConfig, PillarConfig, VoxelConfig
+from pred.models.encoders.pillars import DynamicPillarVFE
 from pred.pretrain import build_model, pretrain
 from pred.run_folder import RunFolderError
 from tests.framework_layouts import MODELS, encoder_specs, names_file, random_state
@@ -67,8 +69,8 @@ def test_weights_are_those_of_the_checkpoint_and_statistics_those_of_whole_scans
     source = build_source(config.data)
     points = [whole_scan(source.load(index), config, torch.device("cpu")) for index in range(2)]
     outputs: list[Tensor] = []
-    layer = model.encoder.vfe.pfn_layers[0]
-    assert isinstance(layer, PointLayer)
+    assert isinstance(model.encoder.vfe, DynamicPillarVFE)
+    layer: Any = model.encoder.vfe.pfn_layers[0]
     layer.linear.register_forward_hook(lambda module, inputs, output: outputs.append(output.detach().double()))
     with torch.no_grad():
         for scan, offsets in points:
@@ -105,14 +107,14 @@ def test_the_sidecar_says_what_a_user_must_know(run: Path, tmp_path: Path) -> No
     facts = json.loads(sidecar(out).read_text())
     assert sidecar(out).name == "weights.pth.json"
     assert facts["sha256"] == hashlib.sha256(out.read_bytes()).hexdigest()
-    assert list(facts["point_channels"]) == ["x", "y", "z", "intensity", "age"] and facts["time_unit"] == "s"
-    assert "metres" in facts["point_channels"]["x"] and "seconds" in facts["point_channels"]["age"]
+    assert list(facts["point_channels"]) == ["x_m", "y_m", "z_m", "intensity", "age_s"] and facts["time_unit"] == "s"
+    assert "metres" in facts["point_channels"]["x_m"] and "seconds" in facts["point_channels"]["age_s"]
     assert facts["point_range_m"] == [-25.6, -25.6, -3.0, 25.6, 25.6, 3.0] and facts["voxel_size_m"] == [0.8, 0.8, 6.0]
     assert (facts["dataset"], facts["sweeps"], facts["step"], facts["seed"]) == ("nuscenes", 1, 3, 0)
     assert (facts["mask_ratio"], facts["mask_strategy"]) == (0.8, "point")
     assert facts["versions"]["torch"] == torch.__version__ and facts["versions"]["pred"]
     assert facts["layout"]["framework"] == "mmdet3d" and facts["layout"]["key"] == "state_dict"
-    assert facts["layout"]["mmdet3d"] == {"prefix": "pts_", "stride1_conv": True, "dynamic_pillars": False}
+    assert facts["layout"]["options"] == {"prefix": "pts_", "stride1_conv": True, "dynamic_pillars": False}
     state = torch.load(out, weights_only=True)["state_dict"]
     described = {name: (tuple(value["shape"]), value["dtype"]) for name, value in facts["tensors"].items()}
     assert described == {name: tuple(spec) for name, spec in specs_of(state).items()}
@@ -154,12 +156,22 @@ def test_a_folder_that_does_not_exist_is_named(run: Path, tmp_path: Path) -> Non
         export(tiny_config(run), run, "openpcdet", tmp_path / "none" / "a.pth", recalibrate_scans=None)
 
 
+class OneLayer(nn.Module):
+    """An encoder of pillar features alone."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.vfe = nn.Module()
+        self.vfe.pfn_layers = nn.ModuleList([nn.ModuleDict({"linear": nn.Linear(11, size, bias=False)})])
+
+
 def _write_for_ever(path: str, size: int) -> None:
-    state = {"vfe.pfn_layers.0.linear.weight": torch.ones(size, 11)}
-    number = 0.0
+    encoder, number = OneLayer(size), 0.0
     while True:
         number += 1
-        write_encoder(Path(path), {name: value * number for name, value in state.items()}, {"number": number})
+        (weight,) = encoder.parameters()
+        weight.data.fill_(number)
+        write_encoder(Path(path), encoder, {"number": number})
 
 
 def test_a_kill_leaves_a_whole_file(tmp_path: Path) -> None:
@@ -362,6 +374,49 @@ def test_import_undoes_export(run: Path, tmp_path: Path) -> None:
         assert all(torch.equal(again[name], value) for name, value in trained.items())
     with pytest.raises(RunFolderError, match="must be new"):
         import_encoder(config, tmp_path / "openpcdet.pth", tmp_path / "openpcdet")
+
+
+SMALL_2D = BEVBackboneConfig(
+    layer_nums=[1, 1],
+    layer_strides=[1, 2],
+    num_filters=[16, 24],
+    upsample_strides=[1, 2],
+    num_upsample_filters=[16, 16],
+)
+ENCODERS = {
+    "pillars": EncoderConfig(pillars=PillarConfig(vfe_filters=[16]), backbone_2d=SMALL_2D),
+    "hard pillars": EncoderConfig(pillars=PillarConfig(vfe_filters=[16, 16], max_points=5), backbone_2d=SMALL_2D),
+    "before 2D": EncoderConfig(pillars=PillarConfig(vfe_filters=[16]), bev="before_2d"),
+    "plain voxels": EncoderConfig(kind="voxels", voxels=VoxelConfig(backbone="plain"), backbone_2d=SMALL_2D),
+    "voxels": EncoderConfig(kind="voxels", voxels=VoxelConfig(conv_bias=False), backbone_2d=SMALL_2D),
+    "biased voxels": EncoderConfig(kind="voxels", backbone_2d=SMALL_2D),
+    "dsvt": EncoderConfig(
+        kind="dsvt",
+        pillars=PillarConfig(vfe_filters=[16, 16]),
+        dsvt=DSVTConfig(d_model=16, num_heads=2, ffn_channels=24, num_blocks=2),
+        backbone_2d=replace(SMALL_2D, kind="residual", conv_for_no_stride=True),
+    ),
+}
+
+
+@pytest.mark.parametrize("to", FRAMEWORKS)
+@pytest.mark.parametrize("kind", ENCODERS)
+def test_a_file_of_each_encoder_comes_back_to_the_bit(kind: str, to: Any, tmp_path: Path) -> None:
+    """Without an option: what the export assumed stands in the file."""
+    path = tmp_path / "encoder.pth"
+    point_range = (-6.4, -6.4, -5.0, 6.4, 6.4, 3.0)
+    encoder, other = (Encoder(ENCODERS[kind], point_range, point_channels=4) for _ in range(2))
+    encoder.load_state_dict(random_state(specs_of(encoder.state_dict())))
+    content = write_encoder(path, encoder, {}, to)
+    count = len(encoder.state_dict()) - (16 if kind == "biased voxels" and to == "mmdet3d" else 0)
+    assert content["layout"]["num_tensors"] == len(content["tensors"]) == count
+    if kind == "biased voxels" and to == "mmdet3d":
+        with pytest.raises(CheckpointError, match="residual convolutions must have no bias"):
+            load_encoder(other, path)
+        return
+    load_encoder(other, path)
+    for name, value in encoder.state_dict().items():
+        assert torch.equal(other.state_dict()[name], value), name
 
 
 def test_a_training_starts_from_imported_weights(run: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import copy
 import csv
 import dataclasses
 import json
@@ -26,7 +27,8 @@ from pred.checkpoint import CheckpointError, list_checkpoints, load_tensors
 from pred.data.batch import DataConfig, TrainingBatches, build_source
 from pred.data.frame import FrameError
 from pred.losses import LossConfig
-from pred.models.encoders.pillars import PillarEncoderConfig
+from pred.models.encoders import BEVBackboneConfig, DSVTConfig, EncoderConfig, PillarConfig, VoxelConfig
+from pred.models.encoders.dsvt import DSVT
 from pred.models.field import FieldConfig
 from pred.models.pretrainer import Pretrainer
 from pred.models.renderer import RendererConfig
@@ -35,6 +37,7 @@ from pred.pretrain import (
     PretrainConfig,
     TrainConfig,
     build_model,
+    build_optimizer,
     load_model,
     one_cycle,
     pretrain,
@@ -460,13 +463,114 @@ def test_one_cycle_agrees_with_torch() -> None:
         schedule.step()
 
 
+@pytest.mark.parametrize("steps", [50, 1000])
+def test_one_cycle_is_that_of_adam_onecycle(steps: int) -> None:
+    """Of OpenPCDet, in step `step` counted from 0: two cosines that meet in step ``int(PCT_START total)``."""
+    train, peak = TrainConfig(), int(0.4 * steps)
+    for step in range(steps):
+        low, end = 3e-4 / 10, 3e-4 / 10 / 1e4
+        if step < peak:
+            share = (1 - math.cos(math.pi * step / peak)) / 2
+            expected = (low + (3e-4 - low) * share, 0.95 - 0.1 * share)
+        else:
+            share = (1 - math.cos(math.pi * (step - peak) / (steps - peak))) / 2
+            expected = (3e-4 + (end - 3e-4) * share, 0.85 + 0.1 * share)
+        assert one_cycle(step / steps, train) == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_optimiser_updates_as_adam_onecycle() -> None:
+    """Adam (Kingma and Ba, algorithm 1, with the step's beta1) after ``p *= 1 - weight_decay lr``, for every one."""
+    train, steps = TrainConfig(weight_decay=0.05, lr=0.01), 30
+    torch.manual_seed(0)
+    model = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.BatchNorm1d(4)).double()
+    optimizer = build_optimizer(model, train)
+    expected = [parameter.detach().clone() for parameter in model.parameters()]
+    first, second = ([torch.zeros_like(value) for value in expected] for _ in range(2))
+    for step in range(steps):
+        learning_rate, beta1 = one_cycle(step / steps, train)
+        for index, parameter in enumerate(model.parameters()):
+            gradient = torch.randn_like(parameter)
+            parameter.grad = gradient.clone()
+            expected[index] *= 1 - 0.05 * learning_rate
+            first[index] = beta1 * first[index] + (1 - beta1) * gradient
+            second[index] = 0.99 * second[index] + 0.01 * gradient**2
+            mean, square = first[index] / (1 - beta1 ** (step + 1)), second[index] / (1 - 0.99 ** (step + 1))
+            expected[index] -= learning_rate * mean / (square.sqrt() + 1e-8)
+        set_schedule(optimizer, train, step / steps)
+        optimizer.step()
+    for parameter, value in zip(model.parameters(), expected, strict=True):
+        torch.testing.assert_close(parameter.detach(), value, rtol=1e-12, atol=1e-14)
+
+
+def attention_steps(model: DSVT, optimizer: torch.optim.Optimizer, train: TrainConfig, steps: range) -> None:
+    generator = torch.Generator().manual_seed(7)
+    cell = torch.arange(20)
+    coords = torch.stack([cell % 2, cell * 0, cell // 5, cell % 5], dim=1)
+    for step in steps:
+        features, target = torch.randn(2, 20, 8, generator=generator)
+        optimizer.zero_grad()
+        (model(features, coords, 2) - target).square().mean().backward()
+        set_schedule(optimizer, train, step / 8)
+        optimizer.step()
+
+
+def small_attention() -> DSVT:
+    torch.manual_seed(0)
+    return DSVT(DSVTConfig(d_model=8, num_heads=2, ffn_channels=8, num_blocks=1, set_size=4, window=(3, 3)), (5, 5))
+
+
+@pytest.mark.parametrize("choice", ["train", "freeze"])
+def test_attention_in_proj_is_trained_or_frozen(choice: Any) -> None:
+    train = TrainConfig(attention_in_proj=choice, lr=0.01, weight_decay=0.1)
+    model = small_attention()
+    initial = {name: value.detach().clone() for name, value in model.named_parameters()}
+    attention_steps(model, build_optimizer(model, train), train, range(8))
+    moved = {name for name, value in model.named_parameters() if not torch.equal(value.detach(), initial[name])}
+    frozen = {name for name in initial if "in_proj" in name}
+    assert len(frozen) == 4  # weight and bias of two layers
+    assert moved == (initial.keys() if choice == "train" else initial.keys() - frozen)
+
+
+def test_attention_in_proj_stays_frozen_after_a_resume() -> None:
+    train = TrainConfig(attention_in_proj="freeze", lr=0.01)
+    whole = small_attention()
+    optimizer = build_optimizer(whole, train)
+    attention_steps(whole, optimizer, train, range(6))
+    resumed = small_attention()
+    resumed.load_state_dict(whole.state_dict())
+    of_resumed = build_optimizer(resumed, train)
+    of_resumed.load_state_dict(copy.deepcopy(optimizer.state_dict()))
+    for model, of_model in ((whole, optimizer), (resumed, of_resumed)):
+        attention_steps(model, of_model, train, range(6, 8))
+    initial = small_attention().state_dict()
+    for name, value in resumed.state_dict().items():
+        assert torch.equal(value, whole.state_dict()[name]), name
+        assert "in_proj" not in name or torch.equal(value, initial[name]), name
+
+
+@pytest.mark.parametrize(
+    ("config", "frozen"), [(DSVTConfig(), 396_288), (DSVTConfig(d_model=192, ffn_channels=384), 889_344)]
+)
+def test_frozen_parameters_of_the_published_models(config: DSVTConfig, frozen: int) -> None:
+    model = DSVT(config, (360, 360))
+    optimizer = build_optimizer(model, TrainConfig(attention_in_proj="freeze"))
+    trained = sum(parameter.numel() for group in optimizer.param_groups for parameter in group["params"])
+    assert sum(parameter.numel() for parameter in model.parameters()) - trained == frozen
+
+
+def test_nothing_to_freeze_is_refused(tmp_path: Path) -> None:
+    config = tiny_config(tmp_path / "run", attention_in_proj="freeze")
+    with pytest.raises(ValueError, match="train.attention_in_proj must be train for a model without attention"):
+        build_optimizer(build_model(config), config.train)
+
+
 def test_batch_norm_statistics_are_those_of_the_final_weights(finished: Path) -> None:
     config = tiny_config(finished)
     network, _ = load_model(config, RunFolder(finished))
     batches = TrainingBatches(config.data, config.point_range, config.train.seed, 12)
     # One layer, by hand: the first of the 2D backbone, over all the steps' inputs (fewer than 16).
     inputs: list[Tensor] = []
-    block: Any = network.encoder.backbone_2d.blocks[0]
+    block: Any = network.encoder.get_submodule("backbone_2d.blocks.0")
     convolution, norm = block[1], block[2]
     convolution.register_forward_hook(lambda module, arguments, output: inputs.append(output))
     network.train()
@@ -557,7 +661,8 @@ def test_csv_log_killed_within_the_header(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "config_class",
     [
-        PretrainConfig, DataConfig, PillarEncoderConfig, FieldConfig, RendererConfig, LossConfig, TrainConfig,
+        PretrainConfig, DataConfig, EncoderConfig, PillarConfig, VoxelConfig, DSVTConfig, BEVBackboneConfig,
+        FieldConfig, RendererConfig, LossConfig, TrainConfig,
     ],
 )  # fmt: skip
 def test_config_classes_document_every_field(config_class: type[Any]) -> None:

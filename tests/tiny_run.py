@@ -13,7 +13,7 @@ import yaml
 
 from pred.data.batch import DataConfig
 from pred.data.world.nuscenes_writer import WorldSettings
-from pred.models.encoders.pillars import PillarEncoderConfig
+from pred.models.encoders import BEVBackboneConfig, EncoderConfig, PillarConfig
 from pred.models.field import FieldConfig
 from pred.models.renderer import RendererConfig
 from pred.pretrain import PretrainConfig, TrainConfig
@@ -48,14 +48,11 @@ def tiny_config(run: Path, **train: Any) -> PretrainConfig:
             depth_rays=48,
             workers=0,
         ),
-        encoder=PillarEncoderConfig(
-            pillar_size=(0.8, 0.8),
-            vfe_filters=[8],
-            layer_nums=[1],
-            layer_strides=[1],
-            num_filters=[8],
-            upsample_strides=[1],
-            num_upsample_filters=[8],
+        encoder=EncoderConfig(
+            pillars=PillarConfig(pillar_size=(0.8, 0.8), vfe_filters=[8]),
+            backbone_2d=BEVBackboneConfig(
+                layer_nums=[1], layer_strides=[1], num_filters=[8], upsample_strides=[1], num_upsample_filters=[8]
+            ),
         ),
         field=FieldConfig(hidden=16, layers=3),
         renderer=RendererConfig(coarse_samples=8, fine_samples=8),

@@ -150,6 +150,13 @@ class DataConfig:
             return self.ego_box
         return ONCE_EGO_BOX if self.dataset == "once" else EGO_BOX
 
+    @property
+    def point_channels(self) -> tuple[str, ...]:
+        """Channels of a point that the encoder gets, as the detectors of the data set: the age, in seconds behind the
+        keyframe, is left out for ONCE, whose frames are single scans."""
+        channels = ("x_m", "y_m", "z_m", "intensity", "age_s")
+        return channels[:4] if self.dataset == "once" else channels
+
 
 class _Parcel:
     """Tensors go between processes by value: a loader's many small ones take milliseconds as shared memory."""
@@ -215,7 +222,8 @@ class Batch(_Parcel):
     Attributes:
         step: training step.
         tokens: B frame tokens.
-        points: [N, 5] float32 visible points of all frames: x, y, z, intensity, dt.
+        points: [N, 5] float32 visible points of all frames: x, y, z, intensity, dt. The encoder takes the channels that
+            `DataConfig.point_channels` names.
         point_offsets: [B + 1] int64, frame b owns points[point_offsets[b]:point_offsets[b + 1]].
         depth: depth rays.
         semantic: semantic rays; None without pseudo labels.

@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from pred.data.batch import Batch, DepthRays, Rays, SemanticRays
 from pred.losses import LossConfig, depth_loss, eikonal_loss, mean_over_valid, semantic_loss
-from pred.models.encoders.pillars import PillarEncoder, PillarEncoderConfig
+from pred.models.encoders import Encoder, EncoderConfig
 from pred.models.field import FieldConfig, FieldDecoder
 from pred.models.renderer import RenderedRays, Renderer, RendererConfig, Sharpness
 
@@ -68,12 +68,12 @@ class Pretrainer(nn.Module):
     Args:
         encoder, field, renderer, loss: configurations of the parts.
         point_range: range box (x_min, y_min, z_min, x_max, y_max, z_max), metres, LiDAR frame.
-        point_channels: D, raw channels per point.
+        point_channels: D, raw channels per point that the encoder uses.
     """
 
     def __init__(
         self,
-        encoder: PillarEncoderConfig,
+        encoder: EncoderConfig,
         field: FieldConfig,
         renderer: RendererConfig,
         loss: LossConfig,
@@ -81,7 +81,7 @@ class Pretrainer(nn.Module):
         point_channels: int = 5,
     ) -> None:
         super().__init__()
-        self.encoder = PillarEncoder(encoder, point_range, point_channels)
+        self.encoder = Encoder(encoder, point_range, point_channels)
         self.field = FieldDecoder(self.encoder.out_channels, field, point_range)
         self.sharpness = Sharpness(renderer.initial_inv_s)
         self.renderer = Renderer(renderer, point_range)

@@ -169,9 +169,9 @@ def test_pretraining(root: Path, tmp_path: Path) -> None:
     sizes = [
         "--data.batch_size", "1", "--data.workers", "0", "--data.depth_rays", "48",
         "--data.semantic_rays_per_camera", "8",
-        "--encoder.pillar_size", "[1.6, 1.6]", "--encoder.vfe_filters", "[8]", "--encoder.layer_nums", "[1]",
-        "--encoder.layer_strides", "[1]", "--encoder.num_filters", "[8]", "--encoder.upsample_strides", "[1]",
-        "--encoder.num_upsample_filters", "[8]", "--field.hidden", "16", "--renderer.coarse_samples", "8",
+        "--encoder.pillars.pillar_size", "[1.6, 1.6]", "--encoder.pillars.vfe_filters", "[8]", "--encoder.backbone_2d",
+        "{layer_nums: [1], layer_strides: [1], num_filters: [8], upsample_strides: [1], num_upsample_filters: [8]}",
+        "--field.hidden", "16", "--renderer.coarse_samples", "8",
         "--renderer.fine_samples", "8", "--train.epochs", "1.5", "--train.log_every", "1", "--train.accelerator", "cpu",
     ]  # fmt: skip
     run = tmp_path / "run"

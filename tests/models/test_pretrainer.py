@@ -17,21 +17,22 @@ from torch import Tensor
 
 from pred.data.batch import Batch, DepthRays, SemanticRays
 from pred.losses import LossConfig
-from pred.models.encoders import PillarEncoderConfig
+from pred.models.encoders import BEVBackboneConfig, EncoderConfig, PillarConfig
 from pred.models.field import FieldConfig
 from pred.models.pretrainer import Pretrainer, PretrainOutput, sum_of_parts
 from pred.models.renderer import RendererConfig
 
 RANGE = (-16.0, -16.0, -5.0, 16.0, 16.0, 3.0)
 GROUND_M = -1.8
-ENCODER = PillarEncoderConfig(
-    pillar_size=(1.0, 1.0),
-    vfe_filters=[8, 8],
-    layer_nums=[1, 1],
-    layer_strides=[1, 2],
-    num_filters=[8, 16],
-    upsample_strides=[1, 2],
-    num_upsample_filters=[8, 8],
+ENCODER = EncoderConfig(
+    pillars=PillarConfig(pillar_size=(1.0, 1.0), vfe_filters=[8, 8]),
+    backbone_2d=BEVBackboneConfig(
+        layer_nums=[1, 1],
+        layer_strides=[1, 2],
+        num_filters=[8, 16],
+        upsample_strides=[1, 2],
+        num_upsample_filters=[8, 8],
+    ),
 )
 FIELD = FieldConfig(hidden=32, frequencies=4, num_classes=3)
 RENDERER = RendererConfig(coarse_samples=16, fine_samples=16)
