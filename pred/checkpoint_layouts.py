@@ -178,6 +178,8 @@ def export_state(
         tensor = state[entry.ours].detach().cpu()
         if entry.minus is not None:
             tensor = tensor - state[entry.minus].detach().cpu()
+        if tensor.is_floating_point():
+            tensor = tensor.float()
         if entry.axes is not None:
             tensor = tensor.permute(entry.axes)
         exported[entry.theirs] = tensor.clone(memory_format=torch.contiguous_format)

@@ -123,7 +123,23 @@ def encoder_facts(
 
 
 def _caveats(config: PretrainConfig, batch_norm: Mapping[str, Any]) -> list[str]:
-    caveats = ["x, y, z are in the LiDAR frame of the data set: other axes or another range need another training"]
+    encoder = config.encoder
+    caveats = [
+        "x, y, z are in the LiDAR frame of the data set, and intensity has its scale: a pipeline with others feeds the "
+        "encoder other numbers",
+        "no shape tells the voxel size, the range in x and y, the number of sweeps or the unit of time",
+    ]
+    if encoder.kind != "voxels":
+        points = encoder.pillars.max_points
+        caveats.append(
+            "pillars are dynamic: every point counts; a hard pillar network takes the maximum over empty slots too"
+            if points is None
+            else f"pillars are hard: the first {points} points count, and empty slots take part in the maximum"
+        )
+    if encoder.kind == "dsvt":
+        caveats.append(
+            "OpenPCDet's and DSVT's adam_onecycle never updates in_proj_weight and in_proj_bias of attention"
+        )
     if batch_norm.get("masked"):
         caveats.append(
             f"the running statistics of batch normalisation are those of scans of which {config.data.mask_ratio:.0%} "
@@ -165,6 +181,7 @@ def write_encoder(
         raise LayoutError(f"parts must be modules of the encoder, got {', '.join(unknown)}")
     chosen = {name: tensor for name, tensor in state.items() if name.split(".")[0] in parts}
     exported = export_state(chosen, to, options, conv_here)
+    resolved = (options or LayoutOptions()).resolved(shapes_of(chosen), to, conv_here)
     layout: dict[str, Any] = {
         "framework": to,
         "key": WRAPPERS[to],
@@ -174,7 +191,8 @@ def write_encoder(
         "modules": dict(Counter(name.split(".")[0] for name in exported)),
         "num_tensors": len(exported),
         "num_tensors_here": len(chosen),
-        "options": asdict((options or LayoutOptions()).resolved(shapes_of(chosen), to, conv_here)),
+        "options": asdict(resolved),
+        "use_conv_for_no_stride": resolved.stride1_conv,
     }
     content = {**facts, "layout": layout}
     # While the file is replaced there is none of the old facts beside it.

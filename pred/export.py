@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from pred import __version__
 from pred.checkpoint import load_tensors, save_checkpoint
@@ -126,6 +127,16 @@ def recalibrate_on_whole_scans(model: Pretrainer, config: PretrainConfig, num_sc
     model.cpu()
     if not used:
         raise ValueError(f"export: scans must be readable, got none of {len(source)}\n{way_out}")
+    unset = [
+        name
+        for name, layer in model.encoder.named_modules()
+        if isinstance(layer, _BatchNorm) and layer.num_batches_tracked == 0
+    ]
+    if unset:
+        raise ValueError(
+            f"export: scans must hold points inside point_range, got none from which {unset[0]} could take statistics\n"
+            f"{way_out}"
+        )
     return {
         "source": "whole scans",
         "masked": False,

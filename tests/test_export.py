@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from pred import cli
 from pred.checkpoint import CheckpointError, list_checkpoints, load_tensors, save_tensors
@@ -36,6 +37,28 @@ from pred.pretrain import build_model, pretrain
 from pred.run_folder import RunFolderError
 from tests.framework_layouts import MODELS, encoder_specs, names_file, random_state
 from tests.tiny_run import tiny_config, write_config
+
+SMALL_2D = BEVBackboneConfig(
+    layer_nums=[1, 1],
+    layer_strides=[1, 2],
+    num_filters=[16, 24],
+    upsample_strides=[1, 2],
+    num_upsample_filters=[16, 16],
+)
+ENCODERS = {
+    "pillars": EncoderConfig(pillars=PillarConfig(vfe_filters=[16]), backbone_2d=SMALL_2D),
+    "hard pillars": EncoderConfig(pillars=PillarConfig(vfe_filters=[16, 16], max_points=5), backbone_2d=SMALL_2D),
+    "before 2D": EncoderConfig(pillars=PillarConfig(vfe_filters=[16]), bev="before_2d"),
+    "plain voxels": EncoderConfig(kind="voxels", voxels=VoxelConfig(backbone="plain"), backbone_2d=SMALL_2D),
+    "voxels": EncoderConfig(kind="voxels", voxels=VoxelConfig(conv_bias=False), backbone_2d=SMALL_2D),
+    "biased voxels": EncoderConfig(kind="voxels", backbone_2d=SMALL_2D),
+    "dsvt": EncoderConfig(
+        kind="dsvt",
+        pillars=PillarConfig(vfe_filters=[16, 16]),
+        dsvt=DSVTConfig(d_model=16, num_heads=2, ffn_channels=24, num_blocks=2),
+        backbone_2d=replace(SMALL_2D, kind="residual", conv_for_no_stride=True),
+    ),
+}
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +107,44 @@ def test_weights_are_those_of_the_checkpoint_and_statistics_those_of_whole_scans
     assert content["batch_norm"] == {
         "source": "whole scans", "masked": False, "scans": 2, "skipped": 0, "split": None,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["voxels", "dsvt"])
+def test_statistics_of_every_layer_are_those_of_the_whole_scan(kind: str, run: Path, tmp_path: Path) -> None:
+    """One scan, so that the average over scans is that of the scan."""
+    config = replace(tiny_config(run), encoder=ENCODERS[kind])
+    config = replace(config, point_range=(-12.8, -12.8, -5.0, 12.8, 12.8, 3.0))
+    encoder = build_model(config).encoder
+    write_encoder(tmp_path / "initial.pth", encoder, {})
+    import_encoder(config, tmp_path / "initial.pth", tmp_path / "run")
+    export(config, tmp_path / "run", "openpcdet", tmp_path / "encoder.pth", recalibrate_scans=1)
+    exported = encoder.state_dict() | read_weights(tmp_path / "encoder.pth").state
+    seen: dict[str, Tensor] = {}
+    for name, layer in encoder.named_modules():
+        if isinstance(layer, _BatchNorm):
+            layer.register_forward_hook(
+                lambda module, inputs, output, name=name: seen.update({name: inputs[0].transpose(0, 1).flatten(1)})
+            )
+    scan, offsets = whole_scan(build_source(config.data).load(0), config, torch.device("cpu"))
+    with torch.no_grad():
+        encoder.train()(scan, offsets)
+    assert len(seen) >= 10
+    for name, values in seen.items():
+        torch.testing.assert_close(exported[f"{name}.running_mean"], values.mean(1), rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(exported[f"{name}.running_var"], values.var(1), rtol=1e-3, atol=1e-6)
+    for name, count in exported.items():
+        if name.endswith("num_batches_tracked"):
+            assert count == 1, name
+
+
+def test_scans_without_points_give_no_statistics(run: Path, tmp_path: Path) -> None:
+    config = tiny_config(run)
+    file = tmp_path / "encoder.pth"
+    import_encoder(config, run / "encoder.pth", tmp_path / "run")
+    config.point_range = (925.6, 925.6, -3.0, 976.8, 976.8, 3.0)
+    with pytest.raises(ValueError, match=r"(?s)must hold points inside point_range.*vfe\.pfn_layers.*--no-recalibrate"):
+        export(config, tmp_path / "run", "openpcdet", file, recalibrate_scans=1)
+    assert not file.exists()
 
 
 def test_without_recalibration_every_bit_is_the_checkpoint_s(run: Path, tmp_path: Path) -> None:
@@ -374,29 +435,6 @@ def test_import_undoes_export(run: Path, tmp_path: Path) -> None:
         assert all(torch.equal(again[name], value) for name, value in trained.items())
     with pytest.raises(RunFolderError, match="must be new"):
         import_encoder(config, tmp_path / "openpcdet.pth", tmp_path / "openpcdet")
-
-
-SMALL_2D = BEVBackboneConfig(
-    layer_nums=[1, 1],
-    layer_strides=[1, 2],
-    num_filters=[16, 24],
-    upsample_strides=[1, 2],
-    num_upsample_filters=[16, 16],
-)
-ENCODERS = {
-    "pillars": EncoderConfig(pillars=PillarConfig(vfe_filters=[16]), backbone_2d=SMALL_2D),
-    "hard pillars": EncoderConfig(pillars=PillarConfig(vfe_filters=[16, 16], max_points=5), backbone_2d=SMALL_2D),
-    "before 2D": EncoderConfig(pillars=PillarConfig(vfe_filters=[16]), bev="before_2d"),
-    "plain voxels": EncoderConfig(kind="voxels", voxels=VoxelConfig(backbone="plain"), backbone_2d=SMALL_2D),
-    "voxels": EncoderConfig(kind="voxels", voxels=VoxelConfig(conv_bias=False), backbone_2d=SMALL_2D),
-    "biased voxels": EncoderConfig(kind="voxels", backbone_2d=SMALL_2D),
-    "dsvt": EncoderConfig(
-        kind="dsvt",
-        pillars=PillarConfig(vfe_filters=[16, 16]),
-        dsvt=DSVTConfig(d_model=16, num_heads=2, ffn_channels=24, num_blocks=2),
-        backbone_2d=replace(SMALL_2D, kind="residual", conv_for_no_stride=True),
-    ),
-}
 
 
 @pytest.mark.parametrize("to", FRAMEWORKS)
