@@ -41,6 +41,7 @@ from pred.config import plain
 from pred.run_folder import environment
 
 if TYPE_CHECKING:
+    from pred.models.encoders import EncoderConfig
     from pred.pretrain import PretrainConfig
 
 CHANNEL_UNITS = {
@@ -104,7 +105,7 @@ def encoder_facts(
     return {
         "encoder": type(encoder).__name__,
         "encoder_kind": config.encoder.kind,
-        "encoder_config": plain(config.encoder),
+        "encoder_config": _used_config(config.encoder),
         "dataset": data.dataset,
         "split": data.split,
         "point_range_m": [float(value) for value in config.point_range],
@@ -120,6 +121,14 @@ def encoder_facts(
         "versions": environment()["versions"],
         "caveats": [*_caveats(config, batch_norm)],
     }
+
+
+def _used_config(encoder: EncoderConfig) -> dict[str, Any]:
+    """Without the parts of other kinds of encoders."""
+    parts = {"pillars": ["pillars"], "voxels": ["voxels"], "dsvt": ["pillars", "dsvt"]}[encoder.kind]
+    if encoder.bev == "after_2d":
+        parts.append("backbone_2d")
+    return {name: value for name, value in plain(encoder).items() if name in ("kind", "bev", *parts)}
 
 
 def _caveats(config: PretrainConfig, batch_norm: Mapping[str, Any]) -> list[str]:

@@ -168,7 +168,7 @@ def compare(found: Mapping[str, Spec], wanted: Mapping[str, Spec], only: Collect
 
 
 def report(comparison: Comparison) -> str:
-    """The comparison for people: N/M by module, every problem with its probable cause."""
+    """The comparison for people: N/M by module, every problem with its probable cause; whole modules in one line."""
     lines = [
         f"{module:<20} {comparison.matched[module]}/{count} matched" for module, count in comparison.wanted.items()
     ]
@@ -184,8 +184,21 @@ def report(comparison: Comparison) -> str:
         lines.append("nothing to compare: the model has none of the modules")
     if comparison.cause:
         lines.append(comparison.cause)
-    lines += [f"{problem.kind:<9} {problem.name} {problem.text}" for problem in comparison.problems]
+    for (kind, module), problems in _by_module(comparison.problems).items():
+        whole = len(problems) == comparison.wanted[module] if kind == "missing" else module not in comparison.wanted
+        if whole and kind in ("missing", "left over"):
+            side = "the file holds" if kind == "missing" else "the model has"
+            lines.append(f"{kind:<9} {module}: all {len(problems)} tensors; {side} nothing of {module}")
+        else:
+            lines += [f"{kind:<9} {problem.name} {problem.text}" for problem in problems]
     return "\n".join(lines)
+
+
+def _by_module(problems: list[Problem]) -> dict[tuple[str, str], list[Problem]]:
+    groups: dict[tuple[str, str], list[Problem]] = {}
+    for problem in problems:
+        groups.setdefault((problem.kind, _module(problem.name)), []).append(problem)
+    return groups
 
 
 def specs_of(state: Mapping[str, Tensor]) -> dict[str, Spec]:

@@ -174,6 +174,9 @@ def test_the_sidecar_says_what_a_user_must_know(run: Path, tmp_path: Path) -> No
     assert (facts["dataset"], facts["sweeps"], facts["step"], facts["seed"]) == ("nuscenes", 1, 3, 0)
     assert (facts["mask_ratio"], facts["mask_strategy"]) == (0.8, "point")
     assert facts["versions"]["torch"] == torch.__version__ and facts["versions"]["pred"]
+    assert facts["encoder_kind"] == "pillars" and set(facts["encoder_config"]) == {
+        "kind", "bev", "pillars", "backbone_2d",
+    }  # fmt: skip
     assert facts["layout"]["framework"] == "mmdet3d" and facts["layout"]["key"] == "state_dict"
     assert facts["layout"]["options"] == {"prefix": "pts_", "stride1_conv": True, "dynamic_pillars": False}
     state = torch.load(out, weights_only=True)["state_dict"]
@@ -287,7 +290,10 @@ def test_an_export_fills_the_encoder_of_each_model(
 
 MISTAKES: dict[str, tuple[str, str]] = {
     "channels": ("conv_input.0.weight must be", "the file is for points of 4 channels, the model for 5"),
-    "module.": ("left over", "the file's names have a prefix 'module.' too many"),
+    "module.": (
+        "left over module: all 226 tensors; the model has nothing of module",
+        "the file's names have a prefix 'module.' too many",
+    ),
     "model.": ("left over", "the file's names have a prefix 'model.' too many"),
     "no prefix": ("missing", "the file's names lack the prefix 'backbone_3d.'"),
     "one kernel": ("shape     backbone_3d.conv2.0.0.weight", "(32, 16, 3, 3, 3) float32: layers of other widths"),
@@ -295,7 +301,7 @@ MISTAKES: dict[str, tuple[str, str]] = {
     "mmdetection3d": ("missing", "the file has mmdetection3d's names, the model OpenPCDet's"),
     "cells in z": ("backbone_2d.blocks.0.1.weight must be", "follow from the voxel size and the range in z"),
     "transposed": ("backbone_2d.deblocks.0.0.weight must be", "ConvTranspose2d [in, out, k, k] in place of a Conv2d"),
-    "no 2D backbone": ("missing   backbone_2d.blocks.0.1.weight", "the file holds nothing of backbone_2d"),
+    "no 2D backbone": ("missing   backbone_2d: all 84 tensors", "the file holds nothing of backbone_2d"),
     "half": ("type      backbone_3d.conv_input.0.weight", "got (3, 3, 3, 5, 16) float16"),
     "counters": (
         "missing   backbone_3d.conv_input.1.num_batches_tracked",
