@@ -25,15 +25,16 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from pred import cli
 from pred.checkpoint import CheckpointError, list_checkpoints, load_tensors, save_tensors
 from pred.checkpoint_layouts import FRAMEWORKS, LayoutError, export_state, import_state, shapes_of
+from pred.config import build, config_names, config_parser
 from pred.data.batch import build_source
 from pred.data.frame import Frame
-from pred.encoder_file import load_encoder, read_weights, sidecar, write_encoder
+from pred.encoder_file import encoder_facts, load_encoder, read_weights, sidecar, write_encoder
 from pred.evaluate_probe import whole_scan
 from pred.export import export, import_encoder
 from pred.export_check import Comparison, Spec, compare, read_specs, specs_of
 from pred.models.encoders import BEVBackboneConfig, DSVTConfig, Encoder, EncoderConfig, PillarConfig, VoxelConfig
 from pred.models.encoders.pillars import DynamicPillarVFE
-from pred.pretrain import build_model, pretrain
+from pred.pretrain import PretrainConfig, build_model, pretrain
 from pred.run_folder import RunFolderError
 from tests.framework_layouts import MODELS, encoder_specs, names_file, random_state
 from tests.tiny_run import tiny_config, write_config
@@ -255,6 +256,29 @@ def test_a_kill_leaves_a_whole_file(tmp_path: Path) -> None:
         process.join()
     weights = read_weights(path)  # compares with the sidecar where there is one
     assert torch.equal(next(iter(weights.state.values())), torch.full((100_000, 11), weights.facts["number"]))
+
+
+NAMES_OF_CONFIGS = {
+    "nuscenes_hard_pillars": "pcdet_nus_pp", "nuscenes_pillars": "pcdet_nus_dynpp",
+    "nuscenes_voxels": "pcdet_nus_cp_vox01", "nuscenes_dsvt": "dsvt_nus", "once_second": "pcdet_once_second",
+    "once_voxels": "pcdet_once_cp",
+}  # fmt: skip
+"""Detectors of OpenPCDet and DSVT that have the encoder of a named configuration."""
+
+
+@pytest.mark.parametrize("name", config_names())
+def test_named_configurations_load_in_the_detectors_that_they_are_for(name: str, tmp_path: Path) -> None:
+    parser = config_parser("test", "", PretrainConfig)
+    config: PretrainConfig = build(parser, PretrainConfig, parser.parse_args([f"--config={name}"]))
+    encoder = Encoder(config.encoder, config.point_range, len(config.data.point_channels))
+    for to in FRAMEWORKS:
+        content = write_encoder(tmp_path / f"{to}.pth", encoder, encoder_facts(config, encoder, 0, {}), to)
+        assert len(content["point_channels"]) == encoder.point_channels == (4 if config.data.dataset == "once" else 5)
+    assert {*NAMES_OF_CONFIGS} <= {*config_names()}
+    if name in NAMES_OF_CONFIGS:
+        names = names_file(NAMES_OF_CONFIGS[name])
+        for to in ("openpcdet", "dsvt"):
+            assert cli.main(["export", "--check", str(tmp_path / f"{to}.pth"), "--against", str(names)]) == 0
 
 
 # Check
