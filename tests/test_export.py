@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from pred import cli
+from pred import cli, encoder_file
 from pred.checkpoint import CheckpointError, list_checkpoints, load_tensors, save_tensors
 from pred.checkpoint_layouts import FRAMEWORKS, LayoutError, export_state, import_state, shapes_of
 from pred.config import build, config_names, config_parser
@@ -256,6 +256,20 @@ def test_a_kill_leaves_a_whole_file(tmp_path: Path) -> None:
         process.join()
     weights = read_weights(path)  # compares with the sidecar where there is one
     assert torch.equal(next(iter(weights.state.values())), torch.full((100_000, 11), weights.facts["number"]))
+
+
+def test_a_kill_between_file_and_sidecar_leaves_no_old_facts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, encoder = tmp_path / "encoder.pth", OneLayer(4)
+    write_encoder(path, encoder, {"number": 1})
+    assert sidecar(path).is_file()
+
+    def killed(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(encoder_file, "write_text", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_encoder(path, encoder, {"number": 2})
+    assert read_weights(path).facts["number"] == 2 and not sidecar(path).exists()
 
 
 NAMES_OF_CONFIGS = {
