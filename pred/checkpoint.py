@@ -20,6 +20,8 @@ from typing import IO, Any
 import torch
 
 _NAME = re.compile(r"step_(\d{8,})\.pt")
+_REFUSED = re.compile(r"GLOBAL ([\w.]+)")
+_ZIP_START = b"PK\x03\x04"
 TEMPORARY_SUFFIX = ".partial"
 
 
@@ -68,17 +70,23 @@ def save_tensors(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def load_tensors(path: Path) -> dict[str, Any]:
-    """Read what `save_tensors` wrote, onto the CPU.
+    """Read a dictionary of tensors and plain values onto the CPU: what `save_tensors` wrote, or a file of others.
 
     Raises:
         CheckpointError: the file is missing, truncated or damaged, or holds anything but tensors and plain values.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            # torch.load itself does not compare checksums: a flipped bit would become a wrong weight.
-            damaged = archive.testzip()
-        if damaged is not None:
-            raise CheckpointError(f"{path}: must be intact, got a wrong checksum in its part {damaged}")
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                # torch.load itself does not compare checksums: a flipped bit would become a wrong weight.
+                damaged = archive.testzip()
+            if damaged is not None:
+                raise CheckpointError(f"{path}: must be intact, got a wrong checksum in its part {damaged}")
+        elif path.stat().st_size == 0:
+            raise CheckpointError(f"{path}: must be a readable checkpoint, got an empty file")
+        elif _starts_as_zip(path):
+            raise CheckpointError(f"{path}: must be a readable checkpoint, got a truncated one: it has no end")
+        # What is no zip archive may be of the form before torch 1.6.
         state = torch.load(path, map_location="cpu", weights_only=True)
     except CheckpointError:
         raise
@@ -86,11 +94,32 @@ def load_tensors(path: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path}: must exist, got no such file") from None
     # Damage shows as BadZipFile, EOFError, RuntimeError, UnpicklingError, zlib.error, KeyError, ...
     except Exception as error:
-        reason = (str(error).splitlines() or [""])[0]
-        raise CheckpointError(f"{path}: must be a readable checkpoint, got {type(error).__name__}: {reason}") from None
+        raise CheckpointError(f"{path}: must be a readable checkpoint, got {_reason(error)}") from None
     if not isinstance(state, dict):
         raise CheckpointError(f"{path}: must hold a dictionary, got {type(state).__name__}")
     return state
+
+
+def _starts_as_zip(path: Path) -> bool:
+    with open(path, "rb") as file:
+        return file.read(len(_ZIP_START)) == _ZIP_START
+
+
+def _reason(error: Exception) -> str:
+    """What is wrong with a file that torch did not load."""
+    refused = _REFUSED.search(str(error))
+    if refused is None:
+        return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+    name = refused[1]
+    if name.startswith("numpy"):
+        what = f"a NumPy value ({name}), which torch 2.6 and later do not load: somewhere beside the weights"
+    else:
+        what = f"an object of {name}, which only code from the file could make: nothing of it was run"
+    return (
+        f"{what}. Where the file comes from somebody you trust, write the weights alone, with plain values: "
+        "state = torch.load(FILE, map_location='cpu', weights_only=False); torch.save({'model_state': "
+        "dict(state['model_state'])}, NEW) (mmdetection3d: 'state_dict')"
+    )
 
 
 @dataclass

@@ -154,6 +154,98 @@ def view(arguments: list[str]) -> None:
     )
 
 
+def export(arguments: list[str]) -> None:
+    if any(argument.split("=")[0] == "--check" for argument in arguments):
+        export_check(arguments)
+        return
+    from pred.checkpoint_layouts import ENCODER_MODULES, FRAMEWORKS
+    from pred.export import RECALIBRATION_SCANS
+    from pred.export import export as run_export
+
+    def add_options(parser: Any) -> None:
+        parser.add_argument("--to", choices=FRAMEWORKS, required=True, help="framework that is to load the file")
+        parser.add_argument("--out", type=Path, required=True, help="file to write; OUT.json beside it holds the facts")
+        parser.add_argument(
+            "--recalibrate-scans",
+            type=int,
+            default=RECALIBRATION_SCANS,
+            help="whole scans that batch normalisation gets its statistics from",
+        )
+        parser.add_argument(
+            "--no-recalibrate", action="store_true", help="keep the statistics of the training, which saw masked scans"
+        )
+        parser.add_argument(
+            "--parts", default=",".join(ENCODER_MODULES), help="modules to write, with commas; all by default"
+        )
+        _add_layout_options(parser)
+
+    options, config = _options_of_run(
+        "pred export",
+        "Write the encoder of a run as OpenPCDet, DSVT or mmdetection3d loads it. "
+        "pred export --check FILE --against NAMES tells whether a model would take every weight.",
+        arguments,
+        add_options,
+    )
+    run_export(
+        config,
+        Path(options.folder),
+        options.to,
+        options.out,
+        checkpoint=options.checkpoint,
+        recalibrate_scans=None if options.no_recalibrate else options.recalibrate_scans,
+        parts=options.parts.split(","),
+        options=_layout_options(options),
+    )
+
+
+def export_check(arguments: list[str]) -> None:
+    from argparse import ArgumentParser
+
+    parser = ArgumentParser(
+        "pred export", description="Compare the weights in a file with a model's tensors; exit status 1 if one differs."
+    )
+    parser.add_argument("--check", metavar="FILE", type=Path, required=True, help="checkpoint of any framework")
+    parser.add_argument(
+        "--against",
+        metavar="NAMES",
+        type=Path,
+        required=True,
+        help="lines `name (shape) dtype` of the model's state dict, or a checkpoint that the framework wrote",
+    )
+    parser.add_argument(
+        "--only", help="modules to compare, with commas, such as vfe,backbone_3d; those of an encoder by default"
+    )
+    options = parser.parse_args(arguments)
+    from pred.export_check import check_file
+
+    check_file(options.check, options.against, options.only.split(",") if options.only else None)
+
+
+def import_weights(arguments: list[str]) -> None:
+    from pred.config import build, config_parser
+    from pred.pretrain import PretrainConfig
+
+    parser = config_parser(
+        "pred import",
+        "Make a run folder of the encoder in a checkpoint of OpenPCDet, DSVT, mmdetection3d or this package.",
+        PretrainConfig,
+    )
+    parser.add_argument("file", metavar="FILE", type=Path, help="checkpoint")
+    parser.add_argument("--out", type=Path, required=True, help="run folder to make")
+    parser.add_argument(
+        "--kernel-order",
+        choices=("krsc", "dhwio"),
+        default=None,
+        help="sparse kernels are (out, z, y, x, in) or (z, y, x, in, out), where their shapes do not tell",
+    )
+    _add_layout_options(parser)
+    parsed = parser.parse_args(arguments)
+    from pred.export import import_encoder
+
+    config = build(parser, PretrainConfig, parsed)
+    import_encoder(config, parsed.file, parsed.out, _layout_options(parsed), parsed.kernel_order)
+
+
 def world(arguments: list[str]) -> None:
     from pred.config import ConfigParser
     from pred.data.world.nuscenes_writer import MINI_VERSION, WORLD_VERSION, WorldSettings
@@ -262,6 +354,8 @@ COMMANDS = {
         evaluate, "evaluate rendering RUN, probe RUN: errors, a linear probe; once FILE: AP of 3D boxes"
     ),
     "view": Command(view, "view RUN: pictures of what the run renders"),
+    "export": Command(export, "export RUN: encoder weights for OpenPCDet, DSVT, mmdetection3d; --check FILE compares"),
+    "import": Command(import_weights, "import FILE: a run folder of another framework's encoder weights"),
     "world": Command(world, "make OUT: a data set of procedural towns in the nuScenes or ONCE layout"),
     "label": Command(label, "pseudo labels of images by a segmentation network; label train makes one"),
     "data": Command(data, "data check ROOT: what is missing or broken in a data set"),
@@ -331,6 +425,37 @@ def _options_of_run(
     folder.require()
     parsed = parser.parse_args([f"--config={folder.config}", *arguments])
     return parsed, build(parser, PretrainConfig, parsed)
+
+
+def _add_layout_options(parser: Any) -> None:
+    parser.add_argument(
+        "--mmdet3d-prefix",
+        choices=("pts_", "none"),
+        default=None,
+        help="mmdetection3d: before the modules' names; none for DSVT and for detectors of type VoxelNet",
+    )
+    parser.add_argument(
+        "--stride1-deblock",
+        choices=("conv", "deconv"),
+        default=None,
+        help="conv where the framework's 2D backbone or neck has use_conv_for_no_stride; by default as in the encoder "
+        "here (mmdetection3d: conv, deconv for DSVT)",
+    )
+    parser.add_argument(
+        "--dynamic-pillars", action="store_true", help="mmdetection3d: the names of DynamicPillarFeatureNet"
+    )
+
+
+def _layout_options(options: Any) -> Any:
+    from pred.checkpoint_layouts import LayoutOptions
+
+    if (options.mmdet3d_prefix, options.stride1_deblock, options.dynamic_pillars) == (None, None, False):
+        return None
+    return LayoutOptions(
+        prefix={None: None, "none": "", "pts_": "pts_"}[options.mmdet3d_prefix],
+        stride1_conv={None: None, "conv": True, "deconv": False}[options.stride1_deblock],
+        dynamic_pillars=options.dynamic_pillars,
+    )
 
 
 def _usage() -> str:

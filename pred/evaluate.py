@@ -234,8 +234,8 @@ def trained_tokens(folder: RunFolder, data: DataConfig) -> set[str]:
     """
     own = DataConfig(**yaml.safe_load(folder.config.read_text())["data"])
     own = replace(own, labels="none", sweeps=1, image_depth=None, depth_filter=None)
-    assert own.root is not None and data.root is not None
-    if own.dataset != data.dataset:
+    assert data.root is not None
+    if own.root is None or own.dataset != data.dataset:  # imported weights may know no data set
         return set()
     if not Path(own.root).is_dir():
         try:

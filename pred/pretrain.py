@@ -26,10 +26,18 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from torch.optim import AdamW, Optimizer
 
 from pred import __version__
-from pred.checkpoint import CheckpointError, LatestCheckpoint, load_latest, load_tensors, save_checkpoint, save_tensors
+from pred.checkpoint import (
+    CheckpointError,
+    LatestCheckpoint,
+    list_checkpoints,
+    load_latest,
+    load_tensors,
+    save_checkpoint,
+)
 from pred.config import flatten, plain, to_yaml
 from pred.data.batch import Batch, DataConfig, PointRange, TrainingBatches, build_source, make_loader
 from pred.data.frame import NUM_CLASSES, FrameSource
+from pred.encoder_file import encoder_facts, load_encoder, write_encoder
 from pred.losses import LossConfig
 from pred.models.encoders import EncoderConfig
 from pred.models.field import FieldConfig
@@ -40,11 +48,11 @@ from pred.random import seed_of
 from pred.run_folder import CsvLog, RunFolder
 
 FREE_KEYS = {
-    "run", "data.root", "data.info", "data.workers", "train.accelerator", "train.log_every",
+    "run", "init_encoder", "data.root", "data.info", "data.workers", "train.accelerator", "train.log_every",
     "train.checkpoint_every", "train.keep_checkpoints",
 }  # fmt: skip
 """Keys that a resumed run may change: they leave its bits alone, or lie with the user (accelerator). Files may move;
-that they still name the same frames is checked by `frames_digest`."""
+that they still name the same frames is checked by `frames_digest`. A checkpoint needs no initial weights any more."""
 
 DIGEST_FRAMES = 1000
 """Enough to tell any two splits apart, and quick for a million frames."""
@@ -140,6 +148,9 @@ class PretrainConfig:
     """Weights of the loss terms."""
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     """Length, optimiser, precision, logging."""
+    init_encoder: str | None = None
+    """Checkpoint whose encoder the training starts from: RUN/encoder.pth, or a file of OpenPCDet, DSVT or
+    mmdetection3d. Every tensor must fit. None: random weights."""
 
     def __post_init__(self) -> None:
         lower, upper = self.point_range[:3], self.point_range[3:]
@@ -187,6 +198,9 @@ def pretrain(config: PretrainConfig, resume: bool = False) -> Path:
         config.renderer.near_m,
     )
     model = build_model(config)
+    initial = None
+    if config.init_encoder is not None and not (resume and list_checkpoints(folder.checkpoints)):
+        initial = load_encoder(model.encoder, Path(config.init_encoder))
     digest = frames_digest(source)
 
     latest = None
@@ -207,6 +221,7 @@ def pretrain(config: PretrainConfig, resume: bool = False) -> Path:
             "frames": len(source),
             "steps": total_steps,
             "parameters": sum(parameter.numel() for parameter in model.parameters()),
+            **({"init_encoder": initial} if initial is not None else {}),
         }
         folder.record_start(facts, first_step if resume else None)
 
@@ -286,8 +301,12 @@ def pretrain(config: PretrainConfig, resume: bool = False) -> Path:
                 recalibrate_batch_norm(model.module, ((batch.points, batch.point_offsets) for batch in seen))
             save(total_steps)
         if fabric.is_global_zero:
-            export_encoder(folder.encoder, model.module, config, step)
-        progress.message(f"weights: {folder.encoder}")
+            batch_norm = {"source": "training batches", "masked": True, "batches": RECALIBRATION_BATCHES}
+            encoder = model.module.encoder
+            write_encoder(folder.encoder, encoder, encoder_facts(config, encoder, step, batch_norm))
+        progress.message(
+            f"weights: {folder.encoder}; for a detector: pred export {folder.path} --to FRAMEWORK --out FILE"
+        )
     return folder.path
 
 
@@ -412,6 +431,11 @@ def latest_checkpoint(
     latest = load_latest(folder.checkpoints)
     if latest is None:
         return None
+    if "imported" in latest.state:
+        raise CheckpointError(
+            f"{latest.path}: must be of a training, got imported weights; start one from them with --init_encoder "
+            f"{folder.encoder}"
+        )
     now, then = flatten(plain(config)), flatten(latest.state["config"])
     changed = sorted(key for key in now.keys() | then.keys() if now.get(key) != then.get(key) and key not in FREE_KEYS)
     if changed:
@@ -464,30 +488,6 @@ def require_finite(values: dict[str, Tensor], batch: Batch) -> None:
     raise NonFiniteLossError(
         f"pretrain: loss must be finite, got {', '.join(bad)} in step {batch.step + 1}, "
         f"frames {', '.join(batch.tokens)}; the weights are still those of step {batch.step}"
-    )
-
-
-def export_encoder(path: Path, model: Pretrainer, config: PretrainConfig, step: int) -> None:
-    """Write the encoder's weights as OpenPCDet reads them, with what a user of them must know."""
-    encoder = config.encoder
-    save_tensors(
-        path,
-        {
-            "model_state": {name: tensor.cpu() for name, tensor in model.encoder.state_dict().items()},
-            "encoder": type(model.encoder).__name__,
-            "encoder_config": plain(encoder),
-            "point_range_m": [float(value) for value in config.point_range],
-            "voxel_size_m": [float(size) for size in model.encoder.voxel_size],
-            "point_channels": list(config.data.point_channels),
-            "coordinates": "LiDAR frame of the data set",
-            "sweeps": config.data.sweeps,
-            "mask_ratio": config.data.mask_ratio,
-            "mask_strategy": config.data.mask_strategy,
-            "dataset": config.data.dataset,
-            "step": step,
-            "seed": config.train.seed,
-            "pred_version": __version__,
-        },
     )
 
 

@@ -8,7 +8,7 @@ RUN/log.csv                     loss terms by step; the same bytes with and with
 RUN/timing.csv                  rates by step
 RUN/tensorboard/                the same for TensorBoard
 RUN/checkpoints/step_*.pt       see `pred.checkpoint`
-RUN/encoder.pth                 the product, once training has ended
+RUN/encoder.pth, encoder.pth.json  the product, once training has ended; see `pred.encoder_file`
 RUN/pictures/, RUN/*.json       made by `pred view` and `pred evaluate`
 """
 

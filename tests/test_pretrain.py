@@ -92,6 +92,7 @@ def assert_same_run(left: Path, right: Path, note: str = "") -> None:
 def test_run_folder_holds_what_a_reader_needs(finished: Path) -> None:
     assert {path.name for path in finished.iterdir()} == {
         "config.yaml", "run.json", "log.csv", "timing.csv", "tensorboard", "checkpoints", "encoder.pth",
+        "encoder.pth.json",
     }  # fmt: skip
     info = json.loads((finished / "run.json").read_text())
     assert info["frames"] == 2 and info["steps"] == 12 and info["seed"] == 0
@@ -127,8 +128,7 @@ def test_encoder_file_is_plain_and_has_openpcdet_names(finished: Path) -> None:
     assert {name.split(".")[0] for name in expected} == {"vfe", "backbone_2d"}
     for name, value in content["model_state"].items():
         assert torch.equal(value, expected[name]), name
-    assert content["point_channels"][0] == "x_m" and content["point_range_m"][0] == -25.6
-    assert content["voxel_size_m"] == [0.8, 0.8, 6.0]
+    assert content["pred"]["point_range_m"][0] == -25.6 and content["pred"]["voxel_size_m"] == [0.8, 0.8, 6.0]
 
 
 def test_a_folder_that_holds_a_run_is_refused(finished: Path) -> None:

@@ -1,0 +1,327 @@
+# Copyright 2026 The PRED authors
+# SPDX-License-Identifier: Apache-2.0
+"""Files of encoder weights: the one way they are written, and the one way they are read.
+
+FILE       a checkpoint as the framework reads it: ``{"model_state": …}`` (OpenPCDet, DSVT) or ``{"state_dict": …}``
+           (mmdetection3d), plus ``"pred"``: what a user of the weights must know, as plain values. All three
+           frameworks pass over keys that they do not know.
+FILE.json  the same facts, the SHA-256 of FILE, and the name, shape and type of every tensor.
+
+RUN/encoder.pth, written at the end of a training, is such a file in OpenPCDet's layout.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor, nn
+
+from pred.checkpoint import CheckpointError, load_tensors, save_tensors, write_text
+from pred.checkpoint_layouts import (
+    ENCODER_MODULES,
+    FRAMEWORKS,
+    WRAPPERS,
+    Framework,
+    KernelOrder,
+    LayoutError,
+    LayoutOptions,
+    export_state,
+    framework_of,
+    import_state,
+    is_stride1_deblock,
+    shapes_of,
+)
+from pred.config import plain
+from pred.run_folder import environment
+
+if TYPE_CHECKING:
+    from pred.models.encoders import EncoderConfig
+    from pred.pretrain import PretrainConfig
+
+CHANNEL_UNITS = {
+    "x": "metres, LiDAR frame of the data set",
+    "y": "metres, LiDAR frame of the data set",
+    "z": "metres, LiDAR frame of the data set",
+    "intensity": "as stored in the data set, not scaled",
+    "age": "seconds behind the keyframe, 0 for the keyframe's own points",
+}
+
+FACTS = "pred"
+"""Key of a file under which the facts stand."""
+
+HEADS = (
+    "global_step", "dense_head", "point_head", "roi_head", "pfe", "bbox_head", "rpn_head", "pts_bbox_head",
+    "pts_fusion_layer", "img_backbone", "img_neck", "img_bbox_head", "img_rpn_head",
+)  # fmt: skip
+"""Parts of detectors that are no part of a LiDAR encoder; they are left out where one is read."""
+
+
+@dataclass
+class WeightsFile:
+    """The weights in a checkpoint of any framework.
+
+    Attributes:
+        path: the file.
+        state: names and tensors, as in the file.
+        facts: what this package wrote beside them; empty for files of others.
+    """
+
+    path: Path
+    state: dict[str, Tensor]
+    facts: dict[str, Any]
+
+
+def has_conv_for_no_stride(encoder: nn.Module) -> bool:
+    """Whether the 2D backbone has a Conv2d where its resolution stays (`BEVBackboneConfig.conv_for_no_stride`)."""
+    return any(
+        isinstance(layer, nn.Conv2d) and is_stride1_deblock(f"{name}.weight", tuple(layer.weight.shape))
+        for name, layer in encoder.named_modules()
+    )
+
+
+def sidecar(path: Path) -> Path:
+    """Where the facts of a file stand."""
+    return path.with_name(f"{path.name}.json")
+
+
+def encoder_facts(
+    config: PretrainConfig, encoder: nn.Module, step: int, batch_norm: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What a user of an encoder's weights must know, as plain values.
+
+    Args:
+        config: of the run.
+        encoder: its encoder.
+        step: steps it was trained for.
+        batch_norm: where its running statistics come from.
+    """
+    data = config.data
+    return {
+        "encoder": type(encoder).__name__,
+        "encoder_kind": config.encoder.kind,
+        "encoder_config": _used_config(config.encoder),
+        "dataset": data.dataset,
+        "split": data.split,
+        "point_range_m": [float(value) for value in config.point_range],
+        "voxel_size_m": [float(size) for size in encoder.voxel_size],  # type: ignore[union-attr]
+        "point_channels": {name: CHANNEL_UNITS[name.split("_")[0]] for name in data.point_channels},
+        "time_unit": "s",
+        "sweeps": data.sweeps,
+        "mask_ratio": data.mask_ratio,
+        "mask_strategy": data.mask_strategy,
+        "step": step,
+        "seed": config.train.seed,
+        "batch_norm": dict(batch_norm),
+        "versions": environment()["versions"],
+        "caveats": [*_caveats(config, batch_norm)],
+    }
+
+
+def _used_config(encoder: EncoderConfig) -> dict[str, Any]:
+    """Without the parts of other kinds of encoders."""
+    parts = {"pillars": ["pillars"], "voxels": ["voxels"], "dsvt": ["pillars", "dsvt"]}[encoder.kind]
+    if encoder.bev == "after_2d":
+        parts.append("backbone_2d")
+    return {name: value for name, value in plain(encoder).items() if name in ("kind", "bev", *parts)}
+
+
+def _caveats(config: PretrainConfig, batch_norm: Mapping[str, Any]) -> list[str]:
+    encoder = config.encoder
+    caveats = [
+        "x, y, z are in the LiDAR frame of the data set, and intensity has its scale: a pipeline with others feeds the "
+        "encoder other numbers",
+        "no shape tells the voxel size, the range in x and y, the number of sweeps or the unit of time",
+    ]
+    if encoder.kind != "voxels":
+        points = encoder.pillars.max_points
+        caveats.append(
+            "pillars are dynamic: every point counts; a hard pillar network takes the maximum over empty slots too"
+            if points is None
+            else f"pillars are hard: the first {points} points count, and empty slots take part in the maximum"
+        )
+    if encoder.kind == "dsvt":
+        caveats.append(
+            "OpenPCDet's and DSVT's adam_onecycle never updates in_proj_weight and in_proj_bias of attention"
+        )
+    if batch_norm.get("masked"):
+        caveats.append(
+            f"the running statistics of batch normalisation are those of scans of which {config.data.mask_ratio:.0%} "
+            "of the points are hidden; `pred export` takes them from whole scans"
+        )
+    return caveats
+
+
+def write_encoder(
+    path: Path,
+    encoder: nn.Module,
+    facts: Mapping[str, Any],
+    to: Framework = "openpcdet",
+    options: LayoutOptions | None = None,
+    parts: Collection[str] = ENCODER_MODULES,
+) -> dict[str, Any]:
+    """Write an encoder's weights for a framework, and the sidecar; either is replaced at once or not at all.
+
+    Args:
+        path: the file.
+        encoder: whose weights are written.
+        facts: see `encoder_facts`.
+        to: framework.
+        options: of its configuration.
+        parts: modules that are written.
+
+    Returns:
+        The sidecar's content.
+
+    Raises:
+        LayoutError: the framework has no place for a tensor, or a weight is not finite.
+        CheckpointError: the folder does not exist.
+    """
+    if not path.parent.is_dir():
+        raise CheckpointError(f"{path}: folder must exist, got none")
+    state, conv_here = encoder.state_dict(), has_conv_for_no_stride(encoder)
+    unknown = sorted({*parts} - {name.split(".")[0] for name in state})
+    if unknown and {*parts} != {*ENCODER_MODULES}:
+        raise LayoutError(f"parts must be modules of the encoder, got {', '.join(unknown)}")
+    chosen = {name: tensor for name, tensor in state.items() if name.split(".")[0] in parts}
+    exported = export_state(chosen, to, options, conv_here)
+    resolved = (options or LayoutOptions()).resolved(shapes_of(chosen), to, conv_here)
+    layout: dict[str, Any] = {
+        "framework": to,
+        "key": WRAPPERS[to],
+        "sparse_kernels": "(z, y, x, in, out)",
+        "parts": sorted({name.split(".")[0] for name in chosen}),
+        "left_out": sorted({name.split(".")[0] for name in state} - {*parts}),
+        "modules": dict(Counter(name.split(".")[0] for name in exported)),
+        "num_tensors": len(exported),
+        "num_tensors_here": len(chosen),
+        "options": asdict(resolved),
+        "use_conv_for_no_stride": resolved.stride1_conv,
+    }
+    content = {**facts, "layout": layout}
+    # While the file is replaced there is none of the old facts beside it.
+    sidecar(path).unlink(missing_ok=True)
+    save_tensors(path, {WRAPPERS[to]: exported, FACTS: content})
+    described = {
+        **content,
+        "sha256": _sha256(path),
+        "tensors": {
+            name: {"shape": list(tensor.shape), "dtype": str(tensor.dtype).removeprefix("torch.")}
+            for name, tensor in exported.items()
+        },
+    }
+    write_text(sidecar(path), json.dumps(described, indent=2) + "\n")
+    return described
+
+
+def read_weights(path: Path) -> WeightsFile:
+    """The weights in a checkpoint: under ``model_state``, under ``state_dict``, or a flat dictionary.
+
+    Raises:
+        CheckpointError: the file cannot be read, holds no weights, or is not the one that its sidecar describes.
+    """
+    content = load_tensors(path)
+    if sidecar(path).is_file():
+        _require_sidecar(path)
+    for key in ("model_state", "state_dict"):
+        if isinstance(content.get(key), dict):
+            state = content[key]
+            break
+    else:
+        if not content or not all(isinstance(value, Tensor) for value in content.values()):
+            hint = ""
+            if isinstance(content.get("model"), dict) and "config" in content:
+                hint = (
+                    ": this is a checkpoint of a run, of which `pred export RUN --checkpoint FILE` writes the encoder"
+                )
+            raise CheckpointError(
+                f"{path}: must hold weights under model_state or state_dict, or be a dictionary of tensors, got the "
+                f"keys {', '.join(map(str, content)) or 'none'}{hint}"
+            )
+        state = content
+    for name, value in state.items():
+        if not isinstance(value, Tensor):
+            raise CheckpointError(f"{path}: weights must be tensors, got {type(value).__name__} as {name}")
+    facts = content.get(FACTS)
+    return WeightsFile(path, dict(state), facts if isinstance(facts, dict) else {})
+
+
+def load_encoder(
+    encoder: nn.Module,
+    path: Path,
+    options: LayoutOptions | None = None,
+    kernel_order: KernelOrder | None = None,
+) -> dict[str, Any]:
+    """Give an encoder the weights in a checkpoint of OpenPCDet, DSVT, mmdetection3d or this package, all or none.
+
+    Heads of detectors in the file are left out. What this package wrote says itself how it is to be read.
+
+    Args:
+        encoder: gets the weights.
+        path: the checkpoint.
+        options: of the framework's configuration, where names and shapes do not tell; see `LayoutOptions`.
+        kernel_order: of the sparse kernels, where shapes do not tell.
+
+    Returns:
+        Where the weights come from: file, SHA-256, framework, number of tensors, modules left out, and the facts that
+        stand in the file.
+
+    Raises:
+        CheckpointError: the file cannot be read, or its encoder is not this one; the text names each difference and
+            its probable cause.
+    """
+    file = read_weights(path)
+    written = file.facts.get("layout")
+    framework: Framework = "mmdet3d" if framework_of(file.state) == "mmdetection3d" else "openpcdet"
+    if isinstance(written, dict) and written.get("framework") in FRAMEWORKS:
+        kernel_order = kernel_order or "dhwio"
+        options = options or _written_options(written)
+    heads = {name for name in file.state if name.split(".")[0] in HEADS}
+    state = {name: tensor for name, tensor in file.state.items() if name not in heads}
+    try:
+        imported = import_state(
+            state,
+            shapes_of(encoder.state_dict()),
+            framework,
+            options,
+            kernel_order,
+            has_conv_for_no_stride(encoder),
+        )
+    except LayoutError as error:
+        raise CheckpointError(f"{path}: {error}") from None
+    encoder.load_state_dict(imported)
+    return {
+        "file": str(path),
+        "sha256": _sha256(path),
+        "framework": framework,
+        "num_tensors": len(imported),
+        "left_out": sorted({name.split(".")[0] for name in heads}),
+        "facts": file.facts,
+    }
+
+
+def _written_options(layout: Mapping[str, Any]) -> LayoutOptions | None:
+    written = layout.get("options")
+    return LayoutOptions(**written) if isinstance(written, dict) else None
+
+
+def _require_sidecar(path: Path) -> None:
+    try:
+        expected = json.loads(sidecar(path).read_text())["sha256"]
+    except (ValueError, KeyError, TypeError):
+        return  # not one of this package
+    if expected != _sha256(path):
+        raise CheckpointError(f"{path}: must be the file that {sidecar(path).name} describes, got another SHA-256")
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while part := file.read(1 << 20):
+            digest.update(part)
+    return digest.hexdigest()
