@@ -43,6 +43,9 @@ PHASES = {
     "farthest_point_sample": {FORWARD},
     "knn": {FORWARD},
     "ball_query": {FORWARD},
+    "build_rulebook": {FORWARD},
+    "sparse_conv": {FORWARD, BACKWARD},
+    "sparse_max_pool": {FORWARD, BACKWARD},
     "rendering_step": {BACKWARD},
 }
 FOLLOWING = {BACKWARD: BACKWARD_ALONE, SECOND: SECOND_ALONE}
