@@ -137,13 +137,15 @@ class _ResidualBlock(nn.Module):
 
     def forward(self, x: Any) -> Any:
         out = self.conv1(x)
-        out = self.conv2(out.replace_feature(F.relu(self.bn1(out.features))))
-        return out.replace_feature(F.relu(self.bn2(out.features) + x.features))
+        out = self.conv2(out.replace_feature(F.silu(self.bn1(out.features))))
+        return out.replace_feature(F.silu(self.bn2(out.features) + x.features))
 
 
 class _Backbone(nn.Module):
     """VoxelResBackBone8x of OpenPCDet, of `pred.nn` or of spconv; without biases, whose gradients before a batch
-    normalisation are rounding errors and cannot be compared."""
+    normalisation are rounding errors and cannot be compared, and with SiLU for ReLU: where contenders add up in other
+    orders, some units would lie on the other side of its kink, and gradients differ by percents.
+    """
 
     def __init__(self, sparse: Any, channels: int, width: int) -> None:
         super().__init__()
@@ -154,7 +156,7 @@ class _Backbone(nn.Module):
                 if stride == 1
                 else sparse.SparseConv3d(inputs, outputs, size, stride, padding, bias=False, indice_key=key)
             )
-            made: nn.Module = sparse.SparseSequential(conv, _norm(outputs), nn.ReLU())
+            made: nn.Module = sparse.SparseSequential(conv, _norm(outputs), nn.SiLU())
             return made
 
         stages: list[nn.Module] = [layer(channels, width, 3, 1, 1, "subm1")]
