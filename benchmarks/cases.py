@@ -48,6 +48,10 @@ class Sizes:
     pillar_m: float
     """Edge of the pillars whose points `segment_reduce` joins."""
     features: int
+    sparse_sites: int
+    """Voxels of the sparse convolutions, of 0.1 x 0.1 x 0.2 m."""
+    sparse_channels: int
+    """Of a backbone's first stage."""
     step_rays: int
     """Semantic rays of the rendering step, and as many depth rays."""
     step_hidden: int
@@ -75,6 +79,8 @@ REAL = Sizes(
     neighbors=16,
     pillar_m=0.2,
     features=64,
+    sparse_sites=20_000,
+    sparse_channels=16,
     step_rays=512,
     step_hidden=256,
     dsvt_pillars=(4000, 20_000),
@@ -99,6 +105,8 @@ TINY = Sizes(
     neighbors=4,
     pillar_m=3.2,
     features=4,
+    sparse_sites=300,
+    sparse_channels=4,
     step_rays=3,
     step_hidden=16,
     dsvt_pillars=(40, 200),

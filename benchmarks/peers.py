@@ -9,14 +9,16 @@ use the threads they use: "cores busy" in the tables shows how many (spconv's an
 * torch-scatter ``scatter``: `segment_reduce`
 * nerfacc ``render_weight_from_alpha`` and ``accumulate_along_rays`` on dense rays: compositing. Its
   ``importance_sampling`` runs on CUDA only.
+* spconv's layers: a backbone of `sparse_conv`. Its CPU build adds up wrongly with two threads: it takes part with one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from benchmarks.case import Function, Variant
 
@@ -91,3 +93,34 @@ def _with_frame(results: list[Tensor]) -> list[Tensor]:
     """Voxels, (z, y, x) and counts with the frame's number before each coordinate, as int64."""
     voxels, coords, counts = results
     return [voxels, torch.nn.functional.pad(coords.long(), (1, 0)), counts.long()]
+
+
+def sparse_backbone(
+    make: Callable[[Any], nn.Module], names: Sequence[str], sites: Tensor, shape: Sequence[int]
+) -> Peers:
+    """For inputs ``(features, *parameters)`` of one frame; the result is the output sites' features, ascending.
+
+    Args:
+        make: the network, from a module that holds the layers.
+        names: of its parameters.
+        sites, shape: (b, z, y, x) of the features, and cells (z, y, x).
+    """
+
+    def spconv() -> Variant:
+        import spconv.pytorch as library
+
+        library.ops.get_current_stream = lambda: 0  # its backward pass asks for CUDA's and does not use it
+        net, indices = make(library), sites.int()
+
+        def run(features: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
+            if torch.get_num_threads() != 1:
+                raise RuntimeError("spconv's CPU build is right with one thread only")
+            x = library.SparseConvTensor(features, indices, list(shape), 1)
+            out = torch.func.functional_call(net, dict(zip(names, parameters, strict=True)), (x,))
+            z, y, x = out.indices[:, 1:].long().unbind(1)
+            order = ((z * out.spatial_shape[1] + y) * out.spatial_shape[2] + x).argsort()
+            return (out.features[order],)
+
+        return Variant(run)
+
+    return {"spconv": spconv}

@@ -45,6 +45,9 @@ PHASES = {
     "knn": {FORWARD},
     "ball_query": {FORWARD},
     "dsvt": {FORWARD, BACKWARD},
+    "build_rulebook": {FORWARD},
+    "sparse_conv": {FORWARD, BACKWARD},
+    "sparse_max_pool": {FORWARD, BACKWARD},
     "rendering_step": {BACKWARD},
 }
 FOLLOWING = {BACKWARD: BACKWARD_ALONE, SECOND: SECOND_ALONE}
