@@ -3,10 +3,10 @@
 """Fused ops for rendering-based LiDAR pre-training.
 
 Dimensions: ``B`` batch (maps, volumes, frames of points), ``N`` points, rows, or samples of a map, ``M`` voxels,
-queries or boxes, ``R`` rays, ``S`` samples per ray, ``P`` samples of all packed rays, ``C`` channels of a map or columns of a
-row, ``D``, ``H`` and ``W`` layers, rows and columns of a map or volume. Other sizes have the name of the argument that
-sets them. Each op has a plain PyTorch reference of the same meaning in its own module, which is its fallback and its
-oracle; :mod:`pred.ops.reference` gathers them.
+queries or boxes, ``R`` rays, ``S`` samples per ray, ``P`` samples of all packed rays, ``C`` channels of a map or
+columns of a row, ``D``, ``H`` and ``W`` layers, rows and columns of a map or volume. Other sizes have the name of the
+argument that sets them. Each op has a plain PyTorch reference of the same meaning in its own module, which is its
+fallback and its oracle; :mod:`pred.ops.reference` gathers them.
 """
 
 from pred.ops._composite import Composite

@@ -81,9 +81,7 @@ def _arguments(
     return rows, row_scores
 
 
-def _suppress(
-    boxes: Tensor, scores: Tensor, iou_threshold: float, pre_max: int | None, post_max: int | None
-) -> Tensor:
+def _suppress(boxes: Tensor, scores: Tensor, iou_threshold: float, pre_max: int | None, post_max: int | None) -> Tensor:
     rows = (are_boxes(boxes) & ~scores.isnan()).nonzero()[:, 0]
     rows = rows[scores[rows].argsort(descending=True, stable=True)][:pre_max]
     most = rows.shape[0] if post_max is None else post_max
