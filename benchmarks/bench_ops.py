@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from benchmarks import cases, ops_field, ops_points, ops_rays, ops_sampling
+from benchmarks import cases, ops_boxes, ops_field, ops_points, ops_rays, ops_sampling
 from benchmarks.case import SECOND_ALONE, Case, Phase, Variant
 from benchmarks.cases import Sizes
 from benchmarks.measure import Run, time_interleaved
@@ -28,6 +28,7 @@ FAMILIES = {
     "field": ops_field.CASES,
     "rays": ops_rays.CASES,
     "points": ops_points.CASES,
+    "boxes": ops_boxes.CASES,
 }
 CASES = {op: make for family in FAMILIES.values() for op, make in family.items()}
 

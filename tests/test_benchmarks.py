@@ -43,6 +43,11 @@ PHASES = {
     "farthest_point_sample": {FORWARD},
     "knn": {FORWARD},
     "ball_query": {FORWARD},
+    "box_iou_bev": {FORWARD},
+    "box_iou_3d": {FORWARD},
+    "nms_bev": {FORWARD},
+    "points_in_boxes": {FORWARD},
+    "points_in_boxes_mask": {FORWARD},
     "rendering_step": {BACKWARD},
 }
 FOLLOWING = {BACKWARD: BACKWARD_ALONE, SECOND: SECOND_ALONE}
