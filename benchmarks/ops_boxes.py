@@ -39,8 +39,8 @@ def _box_iou_cases(sizes: Sizes, op: str) -> list[Case]:
 
 
 def _eager_iou(a: Tensor, b: Tensor, with_height: bool) -> Tensor:  # [N, M]
-    """Of all pairs, some at a time: the polygon of all sides' crossings and of the corners inside, in the order of their
-    angle."""
+    """Of all pairs, some at a time: the polygon of all sides' crossings and of the corners inside, in the order of
+    their angle."""
     corners_a, corners_b = _corners(a), _corners(b)
     shared = torch.cat([_shared_area(rows[:, None], corners_b[None]) for rows in corners_a.split(64)])
     size_a, size_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
@@ -99,7 +99,7 @@ def _nms_bev_cases(sizes: Sizes) -> list[Case]:
             ours=lambda boxes, scores: (ops.nms_bev(boxes, scores, threshold),),
             reference=lambda boxes, scores: (reference.nms_bev(boxes, scores, threshold),),
             # Every pair in plain PyTorch would take minutes; this looks at the boxes that are left.
-            eager={"best of the rest": Variant(lambda *inputs: (reference.nms_bev(*inputs, threshold),))},
+            eager={"best of the rest": Variant(lambda boxes, scores: (reference.nms_bev(boxes, scores, threshold),))},
             compiled=(),
             tolerance=0.0,
             phases=(Phase(FORWARD, "32 N + 8 K", 32 * sizes.candidates + 8 * kept),),

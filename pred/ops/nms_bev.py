@@ -85,7 +85,7 @@ def _suppress(boxes: Tensor, scores: Tensor, iou_threshold: float, pre_max: int 
     rows = (are_boxes(boxes) & ~scores.isnan()).nonzero()[:, 0]
     rows = rows[scores[rows].argsort(descending=True, stable=True)][:pre_max]
     most = rows.shape[0] if post_max is None else post_max
-    kept = []
+    kept: list[Tensor] = []
     while rows.shape[0] > 0 and len(kept) < most:
         kept.append(rows[:1])
         first, rows = boxes[rows[:1]], rows[1:]
