@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from benchmarks import cases, models, ops_field, ops_points, ops_rays, ops_sampling, ops_sparse
+from benchmarks import cases, models, ops_boxes, ops_field, ops_points, ops_rays, ops_sampling, ops_sparse
 from benchmarks.case import SECOND_ALONE, Case, Phase, Variant
 from benchmarks.cases import Sizes
 from benchmarks.measure import Run, time_interleaved
@@ -30,6 +30,7 @@ FAMILIES = {
     "points": ops_points.CASES,
     "models": models.CASES,
     "sparse": ops_sparse.CASES,
+    "boxes": ops_boxes.CASES,
 }
 CASES = {op: make for family in FAMILIES.values() for op, make in family.items()}
 

@@ -45,6 +45,12 @@ class Sizes:
     samples: int
     """Samples of the first; the queries of the others."""
     neighbors: int
+    boxes: int
+    """Boxes on either side of `box_iou_bev` and `box_iou_3d`."""
+    candidates: int
+    """Boxes before `nms_bev`."""
+    frame_boxes: int
+    """Boxes of `points_in_boxes`, whose points are `points`."""
     pillar_m: float
     """Edge of the pillars whose points `segment_reduce` joins."""
     features: int
@@ -77,6 +83,9 @@ REAL = Sizes(
     search_points=32_768,
     samples=2048,
     neighbors=16,
+    boxes=500,
+    candidates=4096,
+    frame_boxes=50,
     pillar_m=0.2,
     features=64,
     sparse_sites=20_000,
@@ -103,6 +112,9 @@ TINY = Sizes(
     search_points=300,
     samples=12,
     neighbors=4,
+    boxes=12,
+    candidates=60,
+    frame_boxes=5,
     pillar_m=3.2,
     features=4,
     sparse_sites=300,
@@ -279,3 +291,25 @@ def lidar_points(num_points: int, seed: int = 0) -> Tensor:  # [N, 5]: x, y, z, 
         inside = ((points[:, :3] >= low) & (points[:, :3] < high)).all(dim=1)
         sweeps.append(points[inside & (horizontal_m.reshape(-1) < 70)])
     return torch.cat(sweeps)[:num_points].contiguous()
+
+
+def road_users(count: int, seed: int = 0) -> Tensor:  # [N, 7]: x, y, z, length, width, height, yaw
+    """Boxes of cars, trucks, cyclists and people on the ground around the sensor, at any yaw; more of them near it."""
+    generator = _generator(seed)
+    sizes_m = torch.tensor([[4.6, 1.9, 1.7], [9.0, 2.8, 3.4], [1.8, 0.7, 1.7], [0.7, 0.7, 1.8]])
+    kind = torch.multinomial(torch.tensor([0.55, 0.1, 0.1, 0.25]), count, replacement=True, generator=generator)
+    size_m = sizes_m[kind] * (0.85 + 0.3 * torch.rand(count, 3, generator=generator))
+    centre_m = 45 * (2 * torch.rand(count, 2, generator=generator) - 1) * torch.rand(count, 1, generator=generator)
+    z_m = size_m[:, 2:] / 2 - SENSOR_HEIGHT_M
+    yaw_rad = 2 * math.pi * torch.rand(count, 1, generator=generator)
+    return torch.cat([centre_m, z_m, size_m, yaw_rad], dim=1)
+
+
+def detections(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:  # [N, 7] and [N]
+    """What a detector proposes: some eight boxes around every road user, with scores."""
+    generator = _generator(seed + 1)
+    boxes = road_users((count + 7) // 8, seed).repeat(8, 1)[:count]
+    spread = torch.tensor([0.4, 0.4, 0.1, 0.2, 0.1, 0.1, 0.1])
+    boxes = boxes + spread * torch.randn(count, 7, generator=generator)
+    boxes[:, 3:6] = boxes[:, 3:6].clamp_min(0.1)
+    return boxes, torch.rand(count, generator=generator)

@@ -10,6 +10,8 @@ use the threads they use: "cores busy" in the tables shows how many (spconv's an
 * nerfacc ``render_weight_from_alpha`` and ``accumulate_along_rays`` on dense rays: compositing. Its
   ``importance_sampling`` runs on CUDA only.
 * spconv's layers: a backbone of `sparse_conv`. Its CPU build adds up wrongly with two threads: it takes part with one.
+* spconv's ``BoxOps`` (Boost polygons) and shapely: `box_iou_bev`, `nms_bev` and `points_in_boxes`. They start from
+  corners or polygons, which are made outside the time.
 """
 
 from __future__ import annotations
@@ -17,10 +19,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from benchmarks.case import Function, Variant
+from pred.data.boxes import corners_bev
 
 Peers = Mapping[str, Callable[[], Variant]]
 
@@ -124,3 +129,109 @@ def sparse_backbone(
         return Variant(run)
 
     return {"spconv": spconv}
+
+
+def box_iou(boxes_a: Tensor, boxes_b: Tensor, with_height: bool) -> Peers:
+    """For inputs ``(boxes_a, boxes_b)``, all pairs."""
+    sizes_a, sizes_b = (boxes[:, 3 : 6 if with_height else 5].prod(dim=1) for boxes in (boxes_a, boxes_b))
+
+    def over_union(shared: Tensor) -> Tensor:
+        if with_height:
+            top = torch.minimum((boxes_a[:, 2] + boxes_a[:, 5] / 2)[:, None], boxes_b[:, 2] + boxes_b[:, 5] / 2)
+            bottom = torch.maximum((boxes_a[:, 2] - boxes_a[:, 5] / 2)[:, None], boxes_b[:, 2] - boxes_b[:, 5] / 2)
+            shared = shared * (top - bottom).clamp_min(0)
+        return shared / (sizes_a[:, None] + sizes_b - shared)
+
+    def spconv() -> Variant:
+        wrap, box_ops = _spconv_boxes()
+        # Its tensors do not keep the arrays' memory.
+        corners_a, corners_b = _clockwise(boxes_a), _clockwise(boxes_b)
+
+        def run(a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
+            near = _standing_overlap(corners_a, corners_b)
+            found = np.zeros_like(near)
+            box_ops.rbbox_iou(wrap(corners_a), wrap(corners_b), wrap(near), wrap(found), 0.0, with_height)
+            out = torch.from_numpy(found)
+            return (over_union(out) if with_height else out,)
+
+        return Variant(run)
+
+    def shapely() -> Variant:
+        import shapely as library
+
+        polygons_a, polygons_b = (library.polygons(corners_bev(boxes.double().numpy())) for boxes in (boxes_a, boxes_b))
+
+        def run(a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
+            rows, columns = library.STRtree(polygons_b).query(polygons_a, predicate="intersects")
+            shared = torch.zeros(len(a), len(b))
+            areas = library.area(library.intersection(polygons_a[rows], polygons_b[columns]))
+            shared[torch.from_numpy(rows), torch.from_numpy(columns)] = torch.from_numpy(areas).float()
+            return (over_union(shared),)
+
+        return Variant(run)
+
+    return {"spconv": spconv, "shapely": shapely}
+
+
+def nms_bev(boxes: Tensor, scores: Tensor, iou_threshold: float) -> Peers:
+    """For inputs ``(boxes, scores)``."""
+
+    def spconv() -> Variant:
+        wrap, box_ops = _spconv_boxes()
+        corners = _clockwise(boxes)
+
+        def run(boxes: Tensor, scores: Tensor) -> tuple[Tensor, ...]:
+            order = scores.argsort(descending=True).int().numpy()
+            near = _standing_overlap(corners, corners)
+            kept = box_ops.rotate_non_max_suppression_cpu(wrap(corners), wrap(order), wrap(near), iou_threshold)
+            return (torch.tensor(list(kept)[len(boxes) :]),)  # before them are as many zeros as there are boxes
+
+        return Variant(run)
+
+    return {"spconv": spconv}
+
+
+def points_in_boxes(boxes: Tensor, first: bool) -> Peers:
+    """For inputs ``(points, boxes)``; the first box of each point, or the mask as uint8."""
+
+    def shapely() -> Variant:
+        import shapely as library
+
+        polygons = library.polygons(corners_bev(boxes.double().numpy()))
+        library.prepare(polygons)
+
+        def run(points: Tensor, boxes: Tensor) -> tuple[Tensor, ...]:
+            x, y, z = points.numpy().T
+            low, high = ((boxes[:, 2] + side * boxes[:, 5] / 2).numpy() for side in (-1, 1))
+            inside = np.stack(
+                [
+                    library.intersects_xy(polygon, x, y) & (z >= low[row]) & (z <= high[row])
+                    for row, polygon in enumerate(polygons)
+                ]
+            )
+            if not first:
+                return (torch.from_numpy(inside).view(torch.uint8),)
+            return (torch.from_numpy(np.where(inside.any(axis=0), inside.argmax(axis=0), -1)),)
+
+        return Variant(run)
+
+    return {"shapely": shapely}
+
+
+def _spconv_boxes() -> tuple[Callable[[NDArray[np.generic]], Any], Any]:
+    """What makes its tensors, and its operations on boxes."""
+    from cumm import tensorview
+    from spconv.core_cc.csrc.utils.boxops import BoxOps
+
+    return tensorview.from_numpy, BoxOps
+
+
+def _clockwise(boxes: Tensor) -> NDArray[np.float32]:  # [N, 4, 2]
+    return np.ascontiguousarray(corners_bev(boxes.double().numpy())[:, ::-1].astype(np.float32))
+
+
+def _standing_overlap(corners_a: NDArray[np.float32], corners_b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[N, M] above 0 where the bounds along x and y overlap: spconv's operations skip the other pairs."""
+    low_a, high_a, low_b, high_b = corners_a.min(1), corners_a.max(1), corners_b.min(1), corners_b.max(1)
+    overlap = np.minimum(high_a[:, None], high_b) - np.maximum(low_a[:, None], low_b)
+    return np.ascontiguousarray(overlap.clip(0).prod(axis=2))

@@ -89,6 +89,12 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "ball_query(Tensor points, Tensor batch_offsets, Tensor queries, Tensor query_offsets, float radius, "
       "SymInt max_points) -> (Tensor indices, Tensor counts)");
 
+  m.def("box_iou_bev(Tensor boxes_a, Tensor boxes_b, bool aligned) -> Tensor");
+  m.def("box_iou_3d(Tensor boxes_a, Tensor boxes_b, bool aligned) -> Tensor");
+  m.def("nms_bev(Tensor boxes, Tensor scores, float iou_threshold, SymInt? pre_max, SymInt? post_max) -> Tensor");
+  m.def("points_in_boxes(Tensor points, Tensor boxes, Tensor? batch_offsets, Tensor? box_offsets) -> Tensor");
+  m.def("points_in_boxes_mask(Tensor points, Tensor boxes) -> Tensor");
+
   m.def("sdf_to_alpha(Tensor sdf, Tensor inv_s, bool last_opaque, Tensor? ray_offsets=None) -> Tensor");
   m.def(
       "sdf_to_alpha_backward(Tensor grad, Tensor sdf, Tensor inv_s, bool need_sdf, bool need_inv_s, "

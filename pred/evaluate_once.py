@@ -25,13 +25,14 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from rich.table import Table
 
-from pred.data.boxes import iou_3d
 from pred.data.frame import FrameError
 from pred.data.once import CLASSES, OnceFrames
 from pred.data.tables import read_json
+from pred.ops import box_iou_3d
 from pred.progress import Progress
 from pred.run_folder import write_json
 
@@ -303,7 +304,8 @@ def pair_ious(truth: Sequence[FrameBoxes], predictions: Sequence[FrameBoxes], io
     else:
         turn = turn % (2 * np.pi)
         allowed = np.minimum(turn, 2 * np.pi - turn) <= np.pi / 2
-    values = np.where(allowed, iou_3d(a, b), 0.0)
+    iou_3d = box_iou_3d(torch.from_numpy(a), torch.from_numpy(b), aligned=True).numpy()
+    values = np.where(allowed, iou_3d, 0.0)
     kept = values > 0
     return Pairs(truth_row[kept], row[kept], values[kept])
 

@@ -48,6 +48,11 @@ PHASES = {
     "build_rulebook": {FORWARD},
     "sparse_conv": {FORWARD, BACKWARD},
     "sparse_max_pool": {FORWARD, BACKWARD},
+    "box_iou_bev": {FORWARD},
+    "box_iou_3d": {FORWARD},
+    "nms_bev": {FORWARD},
+    "points_in_boxes": {FORWARD},
+    "points_in_boxes_mask": {FORWARD},
     "rendering_step": {BACKWARD},
 }
 FOLLOWING = {BACKWARD: BACKWARD_ALONE, SECOND: SECOND_ALONE}

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from pred import cli
-from pred.data.boxes import iou_3d
 from pred.data.frame import Boxes, FrameError
 from pred.data.once_writer import OnceRecord, write_once, write_once_splits
 from pred.evaluate_once import (
@@ -28,6 +28,7 @@ from pred.evaluate_once import (
     score_thresholds,
     with_means,
 )
+from pred.ops import reference
 
 CAR = [10.0, 5.0, -1.0, 4.0, 2.0, 1.5, 0.3]
 
@@ -167,14 +168,14 @@ def test_pairs_are_all_that_overlap() -> None:
     pairs = pair_ious(frames, frames[::-1], "true")
     expected = {}
     for truth, found, first_truth, first in zip(frames, frames[::-1], (0, 30, 30, 70), (0, 20, 60, 60), strict=True):
+        iou = reference.box_iou_3d(torch.from_numpy(truth.boxes), torch.from_numpy(found.boxes)).numpy()
         for i, a in enumerate(truth.boxes):
             for j, b in enumerate(found.boxes):
                 turn = abs(math.remainder(a[6] - b[6], 2 * math.pi))
-                iou = iou_3d(a[None], b[None])[0]
-                if iou > 1e-9 and turn <= math.pi / 2:  # disjoint boxes may share a rounding
-                    expected[first_truth + i, first + j] = iou
+                if iou[i, j] > 0 and turn <= math.pi / 2:
+                    expected[first_truth + i, first + j] = iou[i, j]
     assert len(expected) > 50
-    got = {(i, j): iou for i, j, iou in zip(*(column.tolist() for column in pairs), strict=True) if iou > 1e-9}
+    got = {(i, j): iou for i, j, iou in zip(*(column.tolist() for column in pairs), strict=True)}
     assert got == pytest.approx(expected)
     assert list(zip(pairs.truth, pairs.prediction, strict=True)) == sorted(
         zip(pairs.truth, pairs.prediction, strict=True)

@@ -3,12 +3,17 @@
 """The plain PyTorch references of all ops, under the ops' own names."""
 
 from pred.ops.ball_query import ball_query_reference as ball_query
+from pred.ops.box_iou import box_iou_3d_reference as box_iou_3d
+from pred.ops.box_iou import box_iou_bev_reference as box_iou_bev
 from pred.ops.build_rulebook import build_rulebook_reference as build_rulebook
 from pred.ops.composite_alpha import composite_alpha_reference as composite_alpha
 from pred.ops.composite_rays import composite_rays_reference as composite_rays
 from pred.ops.decode_field import decode_field_reference as decode_field
 from pred.ops.farthest_point_sample import farthest_point_sample_reference as farthest_point_sample
 from pred.ops.knn import knn_reference as knn
+from pred.ops.nms_bev import nms_bev_reference as nms_bev
+from pred.ops.points_in_boxes import points_in_boxes_mask_reference as points_in_boxes_mask
+from pred.ops.points_in_boxes import points_in_boxes_reference as points_in_boxes
 from pred.ops.resample_rays import resample_rays_reference as resample_rays
 from pred.ops.sample_bev import sample_bev_reference as sample_bev
 from pred.ops.sample_bev import sample_bev_with_grad_reference as sample_bev_with_grad
@@ -42,4 +47,9 @@ __all__ = [  # in the order of docs/ops
     "farthest_point_sample",
     "knn",
     "ball_query",
+    "box_iou_bev",
+    "box_iou_3d",
+    "nms_bev",
+    "points_in_boxes",
+    "points_in_boxes_mask",
 ]

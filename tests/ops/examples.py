@@ -289,6 +289,48 @@ def _ball_query(source: Source) -> Arguments:
     return _queries(source) | {"radius": 2.5, "max_points": source.size(6, 0, 20)}
 
 
+def _lattice_boxes(source: Source, count: int) -> Tensor:
+    """Few kinds of boxes on a lattice: many are equal, share sides or lie in each other. Centres, sizes and yaws are
+    exact in every dtype, and no IoU of two of them is within 1e-5 of 0.3 (tests/ops/test_boxes.py)."""
+    sides = 2 + 2 * source.integers(0, 2, count, 3).double()
+    centre, yaw = source.integers(-3, 4, count, 3).double(), 0.5 * source.integers(0, 2, count, 1)
+    return torch.cat([centre, sides, yaw], dim=1)
+
+
+def _box_iou(source: Source) -> Arguments:
+    """Boxes of any size and yaw, the first of which are near each other."""
+    num_a, num_b = source.count, source.size(23, 0, 60)
+    boxes_a, boxes_b = (
+        torch.cat([source.uniform(-6, 6, n, 3), source.uniform(0.5, 6, n, 3), source.uniform(-7, 7, n, 1)], dim=1)
+        for n in (num_a, num_b)
+    )
+    return {"boxes_a": boxes_a, "boxes_b": boxes_b}
+
+
+def _box_iou_aligned(source: Source) -> Arguments:
+    boxes_a = _lattice_boxes(source, source.count)
+    return {"boxes_a": boxes_a, "boxes_b": _lattice_boxes(source, source.count), "aligned": True}
+
+
+def _nms_bev(source: Source) -> Arguments:
+    """Many scores are equal."""
+    scores = source.dyadic(0, 1, source.count, parts=16)
+    return {"boxes": _lattice_boxes(source, source.count), "scores": scores, "iou_threshold": 0.3}
+
+
+def _points_in_boxes_mask(source: Source) -> Arguments:
+    points = source.dyadic(-6, 6, source.count, source.size(4, 3, 6), parts=16)
+    return {"points": points, "boxes": _lattice_boxes(source, source.size(9, 0, 40))}
+
+
+def _points_in_boxes(source: Source) -> Arguments:
+    arguments, frames = _points_in_boxes_mask(source), source.size(3, 1, 5)
+    return arguments | {
+        "batch_offsets": source.offsets(source.count, frames),
+        "box_offsets": source.offsets(len(arguments["boxes"]), frames),
+    }
+
+
 def _decode_field(source: Source) -> Arguments:
     """Elements of ``weights`` and ``biases`` by their own names, see ``by_element``. Points are off the lines through
     cell centres, where the derivative jumps."""
@@ -442,6 +484,12 @@ _SPARSE: dict[str, Any] = {
 
 _CLOUDS: dict[str, Any] = {"features": ("points", "queries"), "reference_compiles": False}
 
+_BOXES: dict[str, Any] = {
+    "features": ("boxes_a", "boxes_b", "boxes", "points", "scores"),
+    "order": 0,
+    "reference_compiles": False,
+}
+
 EXAMPLES = [
     *_examples("sample_bev", _sample_bev, *_PADDINGS, order=2, **_BEV),
     *_examples("sample_bev_with_grad", _sample_bev, *_PADDINGS, **_BEV),
@@ -475,6 +523,14 @@ EXAMPLES = [
     *_examples("farthest_point_sample", _farthest_point_sample, {}, {"start": 4}, order=0, many=9000, **_CLOUDS),
     *_examples("knn", _knn, order=0, **_CLOUDS),
     *_examples("ball_query", _ball_query, order=0, **_CLOUDS),
+    *_examples("box_iou_bev", _box_iou, **_BOXES),
+    *_examples("box_iou_bev", _box_iou_aligned, **_BOXES),
+    *_examples("box_iou_3d", _box_iou, **_BOXES),
+    *_examples("box_iou_3d", _box_iou_aligned, **_BOXES),
+    *_examples("nms_bev", _nms_bev, {}, {"pre_max": 30, "post_max": 7}, **_BOXES),
+    *_examples("points_in_boxes", _points_in_boxes, {}, many=20000, **_BOXES),
+    *_examples("points_in_boxes", _points_in_boxes_mask, {}, many=20000, **_BOXES),
+    *_examples("points_in_boxes_mask", _points_in_boxes_mask, many=20000, **_BOXES),
     *_examples("sdf_to_alpha", _pair, {}, {"last": "opaque"}, {"inv_s": 2.7}, differentiable=("sdf", "inv_s")),
     *_examples(
         "sdf_to_alpha",
