@@ -107,9 +107,15 @@ def main(arguments: Sequence[str]) -> int:
     """Prints the table and writes it, with every run's means, as JSON; 1 where a row does not agree."""
     parser = config_parser("python -m benchmarks.agreement", __doc__ or "", PretrainConfig)
     parser.add_argument("--out", type=str, default="", help="JSON file to write")
-    parsed = parser.parse_args([*arguments, f"--train.steps={STEPS}"])
-    out = parsed.pop("out")
-    found = compare(build(parser, PretrainConfig, parsed))
+    parser.add_argument("--steps", type=int, default=STEPS, help="of every run")
+    parser.add_argument("--last", type=int, default=LAST, help="steps at a run's end that are compared")
+    parser.add_argument("--runs", type=int, default=RUNS, help="of each contender, with neighbouring initial weights")
+    parsed = parser.parse_args(list(arguments))
+    out, steps, last, runs = (parsed.pop(name) for name in ("out", "steps", "last", "runs"))
+    if not 1 <= last <= steps or runs < 2:
+        parser.error(f"--last must be 1 to --steps, --runs at least 2, got {last}, {steps} and {runs}")
+    config = build(parser, PretrainConfig, parsed)
+    found = compare(replace(config, train=replace(config.train, steps=steps)), last, runs)
     print(f"means of the last {found['last']} of {found['steps']} steps, of {found['runs']} runs each\n")
     print(f"{'term':10} {'reference':>10} {'spread':>8} {'fp32':>8} {'bound':>7} {'bf16':>8} {'bound':>7}")
     for row in found["table"]:

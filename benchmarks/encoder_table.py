@@ -110,6 +110,8 @@ def summarise(parameters: int, runs: Mapping[str, Mapping[str, Any]]) -> dict[st
     if len(runs) == len(BACKENDS):
         pairs = list(zip(*(runs[backend]["losses"][:COMPARED] for backend in BACKENDS), strict=True))
         row["largest_relative_difference"] = max(abs(ours - other) / abs(other) for ours, other in pairs)
+        ours, other = (row[backend]["last_loss"] for backend in BACKENDS)
+        row["last_relative_difference"] = ours / other - 1
     return row
 
 
@@ -118,11 +120,14 @@ def markdown(table: Mapping[str, Mapping[str, Any]], steps: int) -> str:
     window = min(WINDOW, steps // 2)
     lines = [
         f"| encoder | parameters | backend | loss, first {window} | last {window} | fall | ms per step | peak MB | "
-        f"losses of {min(COMPARED, steps)} steps differ by |",
-        "| --- |" + " --- |" * 8,
+        f"losses of {min(COMPARED, steps)} steps differ by | last {window} native over reference |",
+        "| --- |" + " --- |" * 9,
     ]
     for family, row in table.items():
-        difference = row.get("largest_relative_difference")
+        at_first, at_last = "–", "–"
+        if "largest_relative_difference" in row:
+            at_first = f"{row['largest_relative_difference']:.1e}"
+            at_last = f"{row['last_relative_difference']:+.2%}"
         for backend in BACKENDS:
             if backend not in row:
                 continue
@@ -130,7 +135,7 @@ def markdown(table: Mapping[str, Mapping[str, Any]], steps: int) -> str:
             lines.append(
                 f"| {family} | {row['encoder_parameters'] / 1e6:.3f} M | {backend} | {figures['first_loss']:.3f} | "
                 f"{figures['last_loss']:.3f} | {figures['fall']:.1%} | {figures['step_ms']:.0f} | "
-                f"{figures['peak_mb']:.0f} | {'–' if difference is None else f'{difference:.1e}'} |"
+                f"{figures['peak_mb']:.0f} | {at_first} | {at_last} |"
             )
     return "\n".join(lines)
 

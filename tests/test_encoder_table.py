@@ -38,13 +38,14 @@ def test_two_steps_of_a_family(tmp_path: Path, native: None, capsys: pytest.Capt
 def test_summary_by_hand() -> None:
     runs = {
         "native": {"losses": [4.0, 2.0, 2.0, 1.0], "step_s": [9.0, 0.1, 0.3, 0.2], "peak_bytes": 5_000_000},
-        "reference": {"losses": [4.0, 2.5, 2.0, 1.0], "step_s": [9.0, 0.4, 0.4, 0.4], "peak_bytes": 6_000_000},
+        "reference": {"losses": [4.0, 2.5, 2.0, 0.5], "step_s": [9.0, 0.4, 0.4, 0.4], "peak_bytes": 6_000_000},
     }
     row = encoder_table.summarise(1500, runs)
     assert row["native"] == {"first_loss": 3.0, "last_loss": 1.5, "fall": 0.5, "step_ms": 200.0, "peak_mb": 5.0}
     assert row["largest_relative_difference"] == pytest.approx(0.2)  # of the second step
+    assert row["last_relative_difference"] == pytest.approx(0.2)  # 1.5 over 1.25
     text = encoder_table.markdown({"pillars": row}, 4).splitlines()
-    assert text[2] == "| pillars | 0.002 M | native | 3.000 | 1.500 | 50.0% | 200 | 5 | 2.0e-01 |"
+    assert text[2] == "| pillars | 0.002 M | native | 3.000 | 1.500 | 50.0% | 200 | 5 | 2.0e-01 | +20.00% |"
 
 
 def test_families_are_of_the_chosen_sizes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
