@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -149,8 +150,26 @@ def test_autocast_computes_in_its_dtype(native: None) -> None:
         (lambda: SubMConv3d(4, 8, 2), "SubMConv3d: kernel_size must be odd"),
         (lambda: SubMConv3d(4, 8, 3, stride=2), "SubMConv3d: stride must be 1"),
         (lambda: SparseConv3d(4, 8, 3, groups=2), "SparseConv3d: groups must be 1, got 2"),
-        (lambda: SparseConv3d(4, 8, (3, 3)), r"SparseConv3d: kernel_size must be .* got \(3, 3\)"),
-        (lambda: SparseConv3d(4, 8, 3, padding=-1), "SparseConv3d: padding must be"),
+        (lambda: SparseConv3d(4, 8, (3, 3)), r"SparseConv3d: kernel_size must hold 3 numbers \(z, y, x\), got 2"),
+        (lambda: SparseConv3d(4, 8, 3, padding=-1), "SparseConv3d: padding must be at least 0, got -1"),
+        (lambda: SubMConv3d(-3, 8, 3), "SubMConv3d: in_channels must be at least 0, got -3"),
+        (lambda: SubMConv3d(4, 8, 5, dilation=2**30), "SubMConv3d: dilation must keep half the kernel"),
+        (lambda: SparseTensor(torch.zeros(0, 4), torch.zeros(0, 4).long(), SHAPE, -1), "batch_size must be at least 0"),
+        (lambda: SparseTensor(torch.zeros(0, 4), torch.zeros(0, 4).long(), (0, 5, 6), 1), "spatial_shape must be at"),
+        (
+            lambda: SparseTensor(torch.zeros(0, 4, device="meta"), torch.zeros(0, 4).long(), SHAPE, 1),
+            r"indices must be on the device of features \(meta\), got cpu",
+        ),
+        (lambda: at_sites([0, 0, 0, 7]).dense(), r"dense: indices must lie inside .* got \[0, 0, 0, 7\] in row 0"),
+        (
+            lambda: at_sites([0, 0, 0, 1], [0, 0, 0, 1]).dense(),
+            "indices must be distinct, got one site in rows 0 and 1",
+        ),
+        (
+            lambda: SparseTensor(torch.zeros(0, 1), torch.zeros(0, 4).long(), (2**30,) * 3, 1).dense(),
+            r"dense: spatial_shape must give at most 2\^62 sites",
+        ),
+        (lambda: chain(nn.Flatten(0)), "features must have shape"),
         (lambda: SparseTensor(torch.zeros(3, 4), torch.zeros(2, 4).long(), SHAPE, 1), "features must have shape"),
         (lambda: SparseTensor(torch.zeros(3, 4), torch.zeros(3, 3).long(), SHAPE, 1), "indices must have shape"),
         (lambda: SparseTensor(torch.zeros(3, 4), torch.zeros(3, 4).long(), (1, 2), 1), "spatial_shape must hold 3"),
@@ -180,6 +199,65 @@ def test_autocast_computes_in_its_dtype(native: None) -> None:
 def test_wrong_use_is_named(make: Callable[[], Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         make()
+
+
+def at_sites(*rows: list[int]) -> SparseTensor:
+    """Ones at these sites of a small grid."""
+    return SparseTensor(torch.ones(len(rows), 1), torch.tensor(rows), (4, 5, 6), 1)
+
+
+@pytest.mark.parametrize(
+    "make,text",
+    [
+        (lambda: chain(nn.GRU(4, 4)), r"SparseSequential: module 0 \(GRU\) must return features \[M, C\], got tuple"),
+        (lambda: SparseSequential(nn.ReLU())(torch.zeros(3, 4)), "SparseSequential: input must be a SparseTensor"),
+        (lambda: nn.Sequential(nn.Linear(4, 4), SubMConv3d(4, 4, 3))(tensor().features), "SubMConv3d: input must be a"),
+        (lambda: SparseInverseConv3d(4, 4, 3, "k")(torch.zeros(3, 4)), "SparseInverseConv3d: input must be a"),
+        (lambda: SparseTensor([[1.0]], torch.zeros(1, 4).long(), SHAPE, 1), "features must be a tensor, got list"),  # type: ignore[arg-type]
+        (lambda: SparseTensor(torch.zeros(1, 1), torch.zeros(1, 4).long(), SHAPE, 1.5), "batch_size must be an int"),  # type: ignore[arg-type]
+        (lambda: SparseTensor(torch.zeros(1, 1), torch.zeros(1, 4).long(), (4.7, 5, 6), 1), "must be an integer, got"),  # type: ignore[arg-type]
+        (lambda: SparseConv3d(4, 8, 3.0), "SparseConv3d: kernel_size must be an integer, got float"),  # type: ignore[arg-type]
+    ],
+)
+def test_wrong_types_are_named(make: Callable[[], Any], text: str) -> None:
+    with pytest.raises(TypeError, match=text):
+        make()
+
+
+def test_numpy_sizes() -> None:
+    layer = SparseConv3d(4, 8, np.array([3, 1, 1]), np.int64(2))  # type: ignore[arg-type]
+    assert layer.kernel_size == (3, 1, 1) and layer.stride == (2, 2, 2)
+    assert all(type(size) is int for size in layer.kernel_size + layer.stride)
+
+
+def test_one_module_twice() -> None:
+    relu = nn.ReLU()
+    layer = SubMConv3d(4, 4, 3)
+    x = tensor()
+    out = SparseSequential(layer, relu, layer, relu)(x)
+    assert torch.equal(out.features, relu(layer(x.replace_feature(relu(layer(x).features))).features))
+
+
+def test_sites_changed_in_place_are_not_those_of_the_key() -> None:
+    x = at_sites([0, 0, 0, 0], [0, 0, 0, 1])
+    layer = SubMConv3d(1, 1, 3, indice_key="k")
+    layer(x)
+    same = SparseTensor(x.features, x.indices.clone().int(), x.spatial_shape, 1, x.rulebooks)
+    layer(same)  # other memory, the same sites
+    x.indices[1, 3] = 5
+    for changed in (x, same):  # what the rulebook was made of is gone
+        with pytest.raises(ValueError, match="SubMConv3d: indice_key 'k' must be of the same sites, got others"):
+            layer(changed)
+    with torch.inference_mode():  # whose tensors count no changes
+        inner = at_sites([0, 0, 0, 0], [0, 0, 0, 1])
+        assert torch.equal(layer(layer(inner)).indices, inner.indices)
+
+
+def test_autocast_leaves_float64_alone() -> None:
+    layer, x = SubMConv3d(4, 8, 3).double(), tensor(dtype=torch.float64)
+    with torch.autocast("cpu", torch.bfloat16):
+        out = layer(x).features
+    assert out.dtype == torch.float64 and torch.equal(out, layer(x).features)
 
 
 def keyframe(root: Path) -> SparseTensor:

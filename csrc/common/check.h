@@ -49,7 +49,8 @@ inline std::string shape_text(const Tensor& tensor) { return shape_text(sizes(te
 inline void check_cpu_tensor(const char* op, const char* name, const Tensor& tensor, int64_t dim, ScalarType dtype) {
   PRED_CHECK(tensor.is_cpu(), op, ": ", name, " must be a CPU tensor, got one on another device");
   PRED_CHECK(tensor.dim() == dim, op, ": ", name, " must have ", dim, " dimensions, got shape ", shape_text(tensor));
-  PRED_CHECK(tensor.scalar_type() == dtype, op, ": ", name, " must have the dtype of the other arguments");
+  PRED_CHECK(tensor.scalar_type() == dtype, op, ": ", name, " must have dtype ", torch::headeronly::toString(dtype),
+             ", got ", torch::headeronly::toString(tensor.scalar_type()));
 }
 
 inline void check_sizes(const char* op, const char* name, const Tensor& tensor, const std::vector<int64_t>& shape) {

@@ -185,11 +185,7 @@ static inline void outer_tile(const S* a, int64_t a_stride, const S* b, int64_t 
                               Compute<S>* sum, int64_t sum_stride) {
   using T = Compute<S>;
   constexpr int W = kWidth<T>, P = kPair<S>;
-  Vec<T, W> tile[kRows][2];
-  for (int r = 0; r < kRows; ++r) {
-    tile[r][0] = load<W>(sum + r * sum_stride);
-    tile[r][1] = load<W>(sum + r * sum_stride + W);
-  }
+  Vec<T, W> tile[kRows][2] = {};
   for (int64_t i = 0; i < samples; i += P) {
     const auto left = load_packed(b), right = load_packed(b + W * P);
 #pragma GCC unroll 16
@@ -201,9 +197,11 @@ static inline void outer_tile(const S* a, int64_t a_stride, const S* b, int64_t 
     a += a_stride * P;
     b += b_stride * P;
   }
+  // Added at the end, so that sums of many tiles lose no more digits than those of as many numbers.
   for (int r = 0; r < kRows; ++r) {
-    store(sum + r * sum_stride, tile[r][0]);
-    store(sum + r * sum_stride + W, tile[r][1]);
+    T* to = sum + r * sum_stride;
+    store(to, load<W>(to) + tile[r][0]);
+    store(to + W, load<W>(to + W) + tile[r][1]);
   }
 }
 

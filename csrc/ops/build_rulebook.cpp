@@ -29,12 +29,13 @@ struct OwnedTable {
   SiteTable table;
 
   explicit OwnedTable(int64_t count) {
-    int64_t slots = 16;
-    while (slots < 2 * count) slots *= 2;
+    int bits = 4;
+    while (int64_t(1) << bits < 2 * count) ++bits;
+    const int64_t slots = int64_t(1) << bits;
     keys = allocate_array<int64_t>(slots);
     rows = allocate_array<int32_t>(slots);
     std::fill_n(keys.get(), slots, int64_t(-1));
-    table = {keys.get(), rows.get(), uint64_t(slots - 1)};
+    table = {keys.get(), rows.get(), bits};
   }
 
   // The row that had the key before, or -1.
@@ -70,16 +71,19 @@ RulebookArgs arguments(const char* op, const Tensor& indices, int64_t num_frames
     const int64_t reach = a.dilation[axis] * (a.kernel[axis] - 1);
     const bool kept = a.stride[axis] == 1 && a.kernel[axis] % 2 == 1 && 2 * a.padding[axis] == reach;
     PRED_CHECK(!submanifold || kept, op,
-               ": a submanifold kernel must have odd sizes, stride 1 and padding dilation (kernel_size - 1) / 2");
+               ": padding must be dilation (kernel_size - 1) / 2 and stride 1 for a submanifold ", "kernel, got ",
+               a.padding[axis], " and ", a.stride[axis], " for a kernel_size of ", a.kernel[axis]);
     const int64_t room = a.in_shape[axis] + 2 * a.padding[axis] - reach - 1;
     PRED_CHECK(room >= 0, op, ": spatial_shape must hold the kernel, got ", a.in_shape[axis], " for one of ",
                reach + 1 - 2 * a.padding[axis], " without the padding");
     a.out_shape[axis] = room / a.stride[axis] + 1;
     PRED_CHECK(keys_in <= kMaxKeys / a.in_shape[axis] && keys_out <= kMaxKeys / a.out_shape[axis], op,
-               ": spatial_shape must give at most 2^62 sites in all frames");
+               ": spatial_shape must give at most 2^62 sites in all frames, got ", shape_text(shape), " in ",
+               num_frames);
     keys_in *= a.in_shape[axis];
     keys_out *= a.out_shape[axis];
-    PRED_CHECK(taps <= 4096 / a.kernel[axis], op, ": kernel_size must give at most 4096 taps");
+    PRED_CHECK(taps <= 4096 / a.kernel[axis], op, ": kernel_size must give at most 4096 taps, got ",
+               shape_text(kernel));
     taps *= a.kernel[axis];
   }
   PRED_CHECK(a.num_sites < kMaxRows / taps, op, ": indices must have fewer than 2^31 rows x taps, got ", a.num_sites,

@@ -38,13 +38,15 @@ PRED_HOST_DEVICE int64_t fed_output(const RulebookArgs& a, int axis, int64_t p, 
 struct SiteTable {
   int64_t* keys;  // -1 where free
   int32_t* rows;
-  uint64_t mask;
+  int bits;  // of a slot's number
 };
 
-// Where a key is, or may be put.
+// Where a key is, or may be put. The product's highest bits depend on all bits of the key: those of a column of a grid
+// are multiples of large powers of two (Knuth, The Art of Computer Programming 3, 6.4: Fibonacci hashing).
 PRED_HOST_DEVICE uint64_t slot_of(const SiteTable& table, int64_t key) {
-  uint64_t slot = (uint64_t(key) * 0x9e3779b97f4a7c15ull >> 20) & table.mask;
-  while (table.keys[slot] != key && table.keys[slot] != -1) slot = (slot + 1) & table.mask;
+  const uint64_t mask = (uint64_t(1) << table.bits) - 1;
+  uint64_t slot = uint64_t(key) * 0x9e3779b97f4a7c15ull >> (64 - table.bits);
+  while (table.keys[slot] != key && table.keys[slot] != -1) slot = (slot + 1) & mask;
   return slot;
 }
 

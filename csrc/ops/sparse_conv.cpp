@@ -68,13 +68,6 @@ void product(const Problem& in, const Tensor& table, const S* source, bool trans
   });
 }
 
-// The sums of a tap are made block by block, so that few taps occupy many threads. Blocks depend on sizes alone.
-Blocks weight_blocks(const Problem& in) {
-  constexpr int64_t kTasks = 64, kLeast = 2048;
-  const int64_t blocks = std::clamp<int64_t>(in.rows_out / kLeast, 1, std::max<int64_t>(1, kTasks / in.taps));
-  return {in.rows_out, std::max<int64_t>(1, (in.rows_out + blocks - 1) / blocks)};
-}
-
 template <typename S>
 void weight_gradient(const Problem& in, const S* grad, S* out) {
   using T = Compute<S>;
@@ -89,7 +82,7 @@ void weight_gradient(const Problem& in, const S* grad, S* out) {
                             nullptr,
                             grad};
   const int64_t columns = k.columns(in.inputs), size = in.outputs * columns;
-  const Blocks blocks = weight_blocks(in);
+  const Blocks blocks = product_sums(in.rows_out, in.taps * size * int64_t(sizeof(T)));
   const int64_t count = blocks.count();
   const auto sums = allocate_array<T>(in.taps * count * size);
   parallel(in.taps * count, 1, [&](int64_t first, int64_t last) {
@@ -97,21 +90,19 @@ void weight_gradient(const Problem& in, const S* grad, S* out) {
     for (int64_t task = first; task < last; ++task) {
       T* part = sums.get() + task * size;
       std::fill_n(part, size, T(0));
-      k.weight(a, task / count, part, scratch.get(), blocks.begin(task % count), blocks.end(task % count));
+      const int64_t block = task / in.taps;  // whose rows stay in cache from tap to tap
+      k.weight(a, task % in.taps, part, scratch.get(), blocks.begin(block), blocks.end(block));
     }
   });
-  parallel(in.taps, 1, [&](int64_t first, int64_t last) {
-    for (int64_t tap = first; tap < last; ++tap) {
-      for (int64_t o = 0; o < in.outputs; ++o) {
-        S* to = out + (o * in.taps + tap) * in.inputs;
-        for (int64_t c = 0; c < in.inputs; ++c) {
-          T sum = 0;
-          for (int64_t block = 0; block < count; ++block) sum += sums[(tap * count + block) * size + o * columns + c];
-          to[c] = narrow<S>(sum);
-        }
-      }
+  const auto total = allocate_array<T>(in.taps * size);
+  add_blocks(sums.get(), count, in.taps * size, in.taps * in.outputs, columns, columns, total.get());
+  for (int64_t tap = 0; tap < in.taps; ++tap) {
+    for (int64_t o = 0; o < in.outputs; ++o) {
+      const T* from = total.get() + tap * size + o * columns;
+      S* to = out + (o * in.taps + tap) * in.inputs;
+      for (int64_t c = 0; c < in.inputs; ++c) to[c] = narrow<S>(from[c]);
     }
-  });
+  }
 }
 
 Tensor sparse_conv(const Tensor& features, const Tensor& weight, const std::optional<Tensor>& bias_in,

@@ -32,8 +32,9 @@ def box_iou_bev(
 
     Returns:
         ``[N, M]``, or ``[N]`` for aligned boxes, in the dtype of the boxes (float32 for half precision), at most 1.
-        Exactly 0 for boxes that touch or are apart, for a box without area, and for a row that is no box: one with a
-        NaN, an infinity or a negative size. Also where an area is beyond float64.
+        Exactly 0 for boxes that are apart, for a box without area, and for a row that is no box: one with a NaN, an
+        infinity or a negative size. Also where an area is beyond float64 or underflows in it. Boxes that touch have 0
+        along the axes, and up to the rounding of their coordinates otherwise.
 
     Raises:
         ValueError: shape, device. TypeError: dtype, ``aligned`` is no bool.

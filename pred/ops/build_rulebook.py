@@ -86,25 +86,16 @@ def build_rulebook_reference(
     return _reference(indices, batch_size, *arguments, submanifold)
 
 
-def output_shape(
-    spatial_shape: Sequence[int],
-    kernel_size: int | Sequence[int],
-    stride: int | Sequence[int] = 1,
-    padding: int | Sequence[int] = 0,
-    dilation: int | Sequence[int] = 1,
-) -> tuple[int, int, int]:
-    """Cells (z, y, x) of a convolution's output, as of ``conv3d``."""
-    kernel, step, pad, spread = (
-        _triple("output_shape", "argument", x) for x in (kernel_size, stride, padding, dilation)
-    )
+Triple = tuple[int, int, int]
+
+
+def output_shape(shape: Triple, kernel: Triple, stride: Triple, padding: Triple, dilation: Triple) -> Triple:
+    """Cells (z, y, x) of a convolution's output, as of ``conv3d``; fewer than 1 where the kernel does not fit."""
     z, y, x = (
-        (spatial_shape[axis] + 2 * pad[axis] - spread[axis] * (kernel[axis] - 1) - 1) // step[axis] + 1
+        (shape[axis] + 2 * padding[axis] - dilation[axis] * (kernel[axis] - 1) - 1) // stride[axis] + 1
         for axis in range(3)
     )
     return z, y, x
-
-
-Triple = tuple[int, int, int]
 
 
 def _reference(
@@ -120,8 +111,7 @@ def _reference(
     device, num_sites = indices.device, indices.shape[0]
     out_shape = output_shape(shape, kernel, stride, padding, dilation)
     sites = indices.long()
-    if not torch.compiler.is_compiling() and device.type == "cpu":
-        _check_sites(sites, batch_size, shape)
+    check_sites("build_rulebook", sites, batch_size, shape)
     tap = torch.cartesian_prod(*(torch.arange(size, device=device) for size in kernel)).view(-1, 3)
     scaled = sites[:, None, 1:] + torch.tensor(padding, device=device) - tap * torch.tensor(dilation, device=device)
     step, extent = torch.tensor(stride, device=device), torch.tensor(out_shape, device=device)
@@ -155,13 +145,16 @@ def _number(frame: Tensor, zyx: Tensor, shape: Triple) -> Tensor:
     return ((frame * shape[0] + zyx[..., 0]) * shape[1] + zyx[..., 1]) * shape[2] + zyx[..., 2]
 
 
-def _check_sites(sites: Tensor, batch_size: int, shape: Triple) -> None:
+def check_sites(op: str, sites: Tensor, batch_size: int, shape: Triple) -> None:
+    """``sites [M, 4]`` int64 must lie inside the grid and be distinct; looked at in eager CPU calls."""
+    if torch.compiler.is_compiling() or sites.device.type != "cpu":
+        return
     extent = torch.tensor([batch_size, *shape])
     outside = ((sites < 0) | (sites >= extent)).any(dim=1).nonzero()
     if outside.numel():
         row = int(outside[0, 0])
         raise ValueError(
-            f"build_rulebook: indices must lie inside batch_size {batch_size} and spatial_shape {list(shape)}, got "
+            f"{op}: indices must lie inside batch_size {batch_size} and spatial_shape {list(shape)}, got "
             f"{sites[row].tolist()} in row {row}"
         )
     keys, order = _number(sites[:, 0], sites[:, 1:], shape).sort(stable=True)
@@ -169,7 +162,7 @@ def _check_sites(sites: Tensor, batch_size: int, shape: Triple) -> None:
     if repeated.numel():
         later = int(order[repeated + 1].min())
         first = int(order[(keys == keys[order == later]).nonzero()[0, 0]])
-        raise ValueError(f"build_rulebook: indices must be distinct, got one site in rows {first} and {later}")
+        raise ValueError(f"{op}: indices must be distinct, got one site in rows {first} and {later}")
 
 
 def _arguments(
@@ -188,15 +181,15 @@ def _arguments(
     check_dtype(op, "indices", indices, (torch.int32, torch.int64))
     check_count(op, "batch_size", batch_size)
     check_flags(op, submanifold=submanifold)
-    shape = _triple(op, "spatial_shape", spatial_shape, 1)
-    kernel = _triple(op, "kernel_size", kernel_size, 1)
-    spread = _triple(op, "dilation", dilation, 1)
-    step, pad = _triple(op, "stride", stride, 1), _triple(op, "padding", padding, 0)
+    shape = triple(op, "spatial_shape", spatial_shape, 1)
+    kernel = triple(op, "kernel_size", kernel_size, 1)
+    spread = triple(op, "dilation", dilation, 1)
+    step, pad = triple(op, "stride", stride, 1), triple(op, "padding", padding, 0)
     if submanifold:
         if any(size % 2 == 0 for size in kernel):
             raise ValueError(f"{op}: kernel_size must be odd for a submanifold convolution, got {list(kernel)}")
         step = (1, 1, 1)
-        pad = (spread[0] * (kernel[0] // 2), spread[1] * (kernel[1] // 2), spread[2] * (kernel[2] // 2))
+        pad = centred_padding(op, kernel, spread)
     if math.prod(kernel) > _MAX_TAPS:
         raise ValueError(f"{op}: kernel_size must give at most {_MAX_TAPS} taps, got {list(kernel)}")
     out_shape = output_shape(shape, kernel, step, pad, spread)
@@ -205,14 +198,32 @@ def _arguments(
             f"{op}: spatial_shape must hold the kernel, got {list(shape)} for kernel_size {list(kernel)}, padding "
             f"{list(pad)}, dilation {list(spread)}"
         )
-    for cells in (shape, out_shape):
-        if max(1, batch_size) * math.prod(cells) > _MAX_KEYS:
-            raise ValueError(f"{op}: spatial_shape must give at most 2^62 sites in all frames, got {list(shape)}")
+    check_grid(op, batch_size, shape)
+    check_grid(op, batch_size, out_shape)
     return shape, kernel, step, pad, spread
 
 
-def _triple(op: str, name: str, value: Any, least: int = 0) -> Triple:
-    """A number for each of z, y and x."""
+def centred_padding(op: str, kernel: Triple, dilation: Triple) -> Triple:
+    """The padding that keeps a grid's cells, of a kernel of odd sizes."""
+    z, y, x = (spread * (size // 2) for spread, size in zip(dilation, kernel, strict=True))
+    if not torch.compiler.is_compiling() and max(z, y, x) > _MAX_EXTENT:
+        raise ValueError(
+            f"{op}: dilation must keep half the kernel within 2^30 cells, got {list(dilation)} for kernel_size "
+            f"{list(kernel)}"
+        )
+    return z, y, x
+
+
+def check_grid(op: str, batch_size: int, shape: Triple) -> None:
+    """Cells must have numbers that int64 holds."""
+    if max(1, batch_size) * math.prod(shape) > _MAX_KEYS:
+        raise ValueError(
+            f"{op}: spatial_shape must give at most 2^62 sites in all frames, got {list(shape)} in {batch_size}"
+        )
+
+
+def triple(op: str, name: str, value: Any, least: int = 0) -> Triple:
+    """A whole number for each of z, y and x, of at least ``least`` and at most 2^30."""
     numbers = tuple(value) if hasattr(value, "__len__") else (value,) * 3
     if len(numbers) != 3:
         raise ValueError(f"{op}: {name} must hold 3 numbers (z, y, x), got {len(numbers)}")
@@ -220,7 +231,7 @@ def _triple(op: str, name: str, value: Any, least: int = 0) -> Triple:
         check_count(op, name, number, least)
         if not torch.compiler.is_compiling() and number > _MAX_EXTENT:
             raise ValueError(f"{op}: {name} must be at most 2^30, got {number}")
-    z, y, x = numbers
+    z, y, x = numbers if torch.compiler.is_compiling() else (int(number) for number in numbers)
     return z, y, x
 
 

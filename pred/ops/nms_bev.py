@@ -45,6 +45,7 @@ def nms_bev(
     """
     _native.refuse_transforms("nms_bev")
     rows, row_scores = _arguments(boxes, scores, iou_threshold, pre_max, post_max)
+    pre_max, post_max = (None if limit is None else min(limit, rows.shape[0]) for limit in (pre_max, post_max))
     if _native.use_native("nms_bev", rows):
         out: Tensor = torch.ops.pred.nms_bev(rows, row_scores, float(iou_threshold), pre_max, post_max)
         return out

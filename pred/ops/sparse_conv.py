@@ -13,6 +13,8 @@ from pred import _native
 from pred.ops._check import check_like, check_shape, check_tensors, widen
 from pred.ops._rulebook import check_tables, padded
 
+_BLOCK_ROWS = 512
+
 
 def sparse_conv(
     features: Tensor,  # [M, C]
@@ -115,10 +117,19 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         grad_features, grad_weight = torch.ops.pred.sparse_conv_backward(
             grad, features, weight, out_to_in, in_to_out, need_features, need_weight
         )
-    if need_bias:  # in the rows' order, for any number of threads
-        one = torch.zeros(grad.shape[0], dtype=torch.int64, device=grad.device)
-        grad_bias = torch.ops.pred.segment_reduce(grad, one, 1, "sum")[0][0]
+    if need_bias:
+        grad_bias = _sum_of_rows(grad)
     return grad_features if need_features else None, grad_weight if need_weight else None, grad_bias, None, None
+
+
+def _sum_of_rows(rows: Tensor) -> Tensor:
+    """``[O]`` of ``[M, O]``, in blocks: equal for any number of threads, and precise for any number of rows."""
+    block = torch.arange(rows.shape[0], device=rows.device) // _BLOCK_ROWS
+    num_blocks = (rows.shape[0] + _BLOCK_ROWS - 1) // _BLOCK_ROWS
+    wide = rows.to(torch.promote_types(rows.dtype, torch.float32))
+    sums = torch.ops.pred.segment_reduce(wide, block, num_blocks, "sum")[0].double()
+    total = torch.ops.pred.segment_reduce(sums, torch.zeros_like(block[:num_blocks]), 1, "sum")[0][0]
+    return total.to(rows.dtype)
 
 
 def _fake_backward(

@@ -21,7 +21,8 @@ def sparse_max_pool(
 ) -> Tensor:  # [M', C]
     """Pools the active sites: ``out[o, c] = max over k, i = out_to_in[o, k] >= 0, of features[i, c]``.
 
-    Sites that are not active do not take part, as in spconv 2.x: a maximum may be negative.
+    Sites that are not active do not take part: a maximum may be negative. (So does spconv 2.x, but for its native
+    algorithm, which starts from 0.)
 
     Args:
         features: ``[M, C]`` float32, float64, bfloat16 or float16.

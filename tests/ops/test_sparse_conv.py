@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -14,6 +16,7 @@ from torch import Tensor
 
 from pred.ops import build_rulebook, reference, sparse_conv, sparse_max_pool
 from pred.ops.build_rulebook import Rulebook, output_shape
+from tests.conftest import KERNEL_ERROR
 
 Triple = tuple[int, int, int]
 
@@ -52,8 +55,9 @@ def dense_arguments(kernel: dict[str, Any]) -> dict[str, Any]:
     return {"stride": kernel.get("stride", 1), "padding": kernel.get("padding", 0), "dilation": dilation}
 
 
-def _triple(value: int | Triple) -> Triple:
-    return (value, value, value) if isinstance(value, int) else value
+def _triple(value: int | Sequence[int]) -> Triple:
+    z, y, x = (value, value, value) if isinstance(value, int) else value
+    return z, y, x
 
 
 def at(grid: Tensor, indices: Tensor) -> Tensor:
@@ -103,7 +107,8 @@ def test_equals_dense_convolution(backend: str, kernel: dict[str, Any], count: i
     window = dense_arguments(kernel)
     ones = dense(torch.ones(count, 1, dtype=torch.float64), indices, batch_size, shape)
     reached = F.conv3d(ones, torch.ones(1, 1, *size, dtype=torch.float64), **window)
-    assert tuple(reached.shape[2:]) == output_shape(shape, size, **window)
+    arguments = (_triple(window.get(name, 1)) for name in ("stride", "padding", "dilation"))
+    assert tuple(reached.shape[2:]) == output_shape(shape, size, *arguments)
     active = indices if kernel.get("submanifold") else (reached[:, 0] > 0.5).nonzero()
     assert torch.equal(rulebook.out_indices, active)
     assert torch.equal((rulebook.out_to_in >= 0).sum(dim=1).double(), at(reached, active)[:, 0])
@@ -133,7 +138,7 @@ def test_exchanged_tables_are_the_transposed_convolution(backend: str, kernel: d
     grid = torch.zeros(batch_size, 3, *shape, dtype=torch.float64, requires_grad=True)
     result = F.conv3d(grid, weight.permute(4, 0, 1, 2, 3), **window)
     (expected,) = torch.autograd.grad(
-        result, grid, dense(features, rulebook.out_indices, batch_size, output_shape(shape, size, **window))
+        result, grid, dense(features, rulebook.out_indices, batch_size, _triple(result.shape[2:]))
     )
     actual = sparse_conv(features, weight, rulebook.in_to_out, rulebook.out_to_in)
     torch.testing.assert_close(actual, at(expected, indices), rtol=0, atol=1e-12)
@@ -217,22 +222,57 @@ def test_a_thousand_problems_have_the_same_bits_with_two_threads(native: None) -
             assert torch.equal(one, two), f"problem {problem}: {count} sites, {kernel}"
 
 
+@pytest.mark.parametrize("exchanged", [False, True], ids=["", "transposed"])
+@pytest.mark.parametrize("kernel", [KERNELS[0], KERNELS[2]], ids=str)
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
-def test_half_precision_is_rounded_once(native: None, dtype: torch.dtype) -> None:
+def test_half_precision_is_rounded_once(
+    native: None, dtype: torch.dtype, kernel: dict[str, Any], exchanged: bool
+) -> None:
     """Sums of exact products are exact in float32: whole numbers below 2^24, here below 256, which halves hold too."""
     indices = sites(500, 1, (5, 12, 12))
-    rulebook = build_rulebook(indices, 1, (5, 12, 12), 3, submanifold=True)
+    rulebook = build_rulebook(indices, 1, (5, 12, 12), **kernel)
+    tables = (rulebook.in_to_out, rulebook.out_to_in) if exchanged else (rulebook.out_to_in, rulebook.in_to_out)
     generator = torch.Generator().manual_seed(5)
-    features = torch.randint(-2, 3, (500, 33), generator=generator).to(dtype).requires_grad_()
-    weight = (torch.randint(-1, 2, (18, 27, 33), generator=generator)).to(dtype).requires_grad_()
-    wide = [features.detach().double().requires_grad_(), weight.detach().double().requires_grad_()]
-    tables = rulebook.out_to_in, rulebook.in_to_out
-    out, exact = sparse_conv(features, weight, *tables), reference.sparse_conv(wide[0], wide[1], *tables)
+    features = torch.randint(-2, 3, (len(tables[1]), 33), generator=generator)
+    weight = torch.randint(-1, 2, (18, 27, 33), generator=generator)
+    bias = torch.randint(-3, 4, (18,), generator=generator)
+    leaves = [x.to(dtype).requires_grad_() for x in (features, weight, bias)]
+    wide = [x.double().requires_grad_() for x in (features, weight, bias)]
+    out = sparse_conv(leaves[0], leaves[1], *tables, leaves[2])
+    exact = reference.sparse_conv(wide[0], wide[1], *tables, wide[2])
     assert out.dtype == dtype and torch.equal(out, exact.to(dtype))
     cotangent = torch.randint(-1, 2, out.shape, generator=generator)
-    actual = torch.autograd.grad(out, [features, weight], cotangent.to(dtype))
+    actual = torch.autograd.grad(out, leaves, cotangent.to(dtype))
     for value, wanted in zip(actual, torch.autograd.grad(exact, wide, cotangent.double()), strict=True):
         assert value.dtype == dtype and torch.equal(value, wanted.to(dtype))
+    pooled = sparse_max_pool(leaves[0], *tables)
+    assert pooled.dtype == dtype and torch.equal(pooled, reference.sparse_max_pool(wide[0], *tables).to(dtype))
+
+
+@pytest.mark.parametrize("taps", [1, 3])
+def test_gradients_of_many_rows_are_precise(native: None, taps: int) -> None:
+    """Equal contributions, which a running float32 sum of 2^19 rows gets wrong in the third digit."""
+    rows = 2**19
+    table = torch.arange(rows, dtype=torch.int32)[:, None].expand(-1, taps).contiguous()
+    leaves = [torch.ones(rows, 1), torch.ones(2, taps, 1, requires_grad=True), torch.ones(2, requires_grad=True)]
+    out = sparse_conv(leaves[0], leaves[1], table, table, leaves[2])
+    exact = rows * float(torch.tensor(0.1))
+    for grad in torch.autograd.grad(out, leaves[1:], torch.full_like(out, 0.1)):
+        torch.testing.assert_close(grad.double(), torch.full_like(grad, exact).double(), rtol=1e-5, atol=0)
+
+
+def test_columns_of_a_grid_of_powers_of_two(native: None) -> None:
+    """Numbers of such sites are multiples of 2^40. With a hash of their low bits all begin in one slot, and a table of
+    so many takes minutes; it should take a tenth of a second.
+    """
+    shape, count = (2**18, 2**20, 2**20), 200_000
+    indices = torch.zeros(count, 4, dtype=torch.int64)
+    indices[:, 1] = torch.arange(count)
+    begin = time.process_time()
+    rulebook = build_rulebook(indices, 1, shape, (3, 1, 1), submanifold=True)
+    assert time.process_time() - begin < 10
+    rows = torch.arange(count, dtype=torch.int32)
+    assert torch.equal(rulebook.out_to_in[:, 1], rows) and torch.equal(rulebook.out_to_in[1:, 0], rows[:-1])
 
 
 def test_a_nan_stays_in_the_outputs_that_read_it(backend: str) -> None:
@@ -323,3 +363,52 @@ def test_wrong_convolution_arguments(backend: str, change: dict[str, Any], error
     }
     with pytest.raises(error, match=f"^sparse_conv: .*{text}"):
         sparse_conv(**(arguments | change))
+
+
+def test_direct_calls_are_checked(native: None) -> None:
+    """Of the bindings, for which no Python has looked at the arguments."""
+    call, line = torch.ops.pred, torch.zeros(2, 4, dtype=torch.int64)
+    line[1, 3] = 1
+    sizes = ([1, 1, 5], [1, 1, 3], [1, 1, 1], [0, 0, 1], [1, 1, 1])
+    table = torch.tensor([[-1, 0, 1], [0, 1, -1]], dtype=torch.int32)
+    features, weight = torch.zeros(2, 4), torch.zeros(3, 3, 4)
+    with pytest.raises(KERNEL_ERROR, match="build_rulebook: indices must have dtype Long, got Int"):
+        call.build_rulebook(line.int(), 1, *sizes, True)
+    with pytest.raises(KERNEL_ERROR, match=r"indices must lie inside batch_size 1 .* got \[0, 0, 0, 5\] in row 0"):
+        call.build_rulebook(line + torch.tensor([0, 0, 0, 5]), 1, *sizes, True)
+    with pytest.raises(KERNEL_ERROR, match="indices must be distinct, got one site in rows 0 and 1"):
+        call.build_rulebook(0 * line, 1, *sizes, True)
+    with pytest.raises(KERNEL_ERROR, match=r"padding must be .* got 2 and 1 for a kernel_size of 3"):
+        call.build_rulebook(line, 1, *sizes[:3], [0, 0, 2], [1, 1, 1], True)
+    with pytest.raises(KERNEL_ERROR, match=r"spatial_shape must give at most 2\^62 sites .* got \[1073741824, "):
+        call.build_rulebook(line, 1, [2**30] * 3, *sizes[1:], True)
+    with pytest.raises(KERNEL_ERROR, match=r"sparse_conv: out_to_in must lie in \[-1, 2\), got 2 in row 0"):
+        call.sparse_conv(features, weight, None, table + (table == 1), table)
+    with pytest.raises(KERNEL_ERROR, match=r"sparse_conv: weight must have shape \[O, K, 4\], got \[3, 3, 5\]"):
+        call.sparse_conv(features, torch.zeros(3, 3, 5), None, table, table)
+    with pytest.raises(KERNEL_ERROR, match=r"sparse_conv: bias must have shape \[3\], got \[4\]"):
+        call.sparse_conv(features, weight, torch.zeros(4), table, table)
+    with pytest.raises(KERNEL_ERROR, match=r"sparse_conv_backward: grad must have shape \[2, 3\], got \[2, 4\]"):
+        call.sparse_conv_backward(features, features, weight, table, table, True, True)
+    with pytest.raises(KERNEL_ERROR, match="sparse_max_pool: in_to_out must have dtype Int, got Long"):
+        call.sparse_max_pool(features, table, table.long())
+    with pytest.raises(KERNEL_ERROR, match=r"sparse_max_pool_backward: winner must have shape \[2, 4\], got \[3, 4\]"):
+        call.sparse_max_pool_backward(features, torch.zeros(3, 4, dtype=torch.int32), table)
+
+
+@pytest.mark.parametrize(
+    "make,text",
+    [
+        (lambda f, t: sparse_max_pool(f[0], t, t), r"sparse_max_pool: features must have shape \[M, C\], got \[4\]"),
+        (lambda f, t: sparse_max_pool(f, t, t[:, :2]), r"in_to_out must have shape \[2, 3\] as features and out_to_in"),
+        (lambda f, t: sparse_max_pool(f, t + 1, t), r"out_to_in must lie in \[-1, 2\), got 2 in row 0"),
+    ],
+)
+def test_wrong_tables_of_a_pool(backend: str, make: Any, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        make(torch.zeros(2, 4), torch.tensor([[-1, 0, 1], [0, 1, -1]], dtype=torch.int32))
+
+
+def test_a_dilation_beyond_the_grid(backend: str) -> None:
+    with pytest.raises(ValueError, match=r"build_rulebook: dilation must keep half the kernel within 2\^30 cells, got"):
+        build_rulebook(torch.zeros(1, 4, dtype=torch.int64), 1, (4, 4, 4), 5, dilation=2**30, submanifold=True)
