@@ -4,8 +4,8 @@
 
 A state dict of an encoder here has OpenPCDet's names (``vfe.…``, ``backbone_3d.…``, ``backbone_2d.…``), and its sparse
 kernels are stored as spconv 2 does, KRSC = (out, z, y, x, in). `layout` lists for every tensor what becomes of it in a
-framework; `export_state` and `import_state` carry that list out. Both are strict: a tensor that is missing, left over,
-of another shape or not finite is an error that names it.
+framework; `export_state` and `import_state` carry that list out. Both are strict: a tensor without a place, of another
+type or not finite is an error that names it, and on import one that is missing, left over or of another shape.
 
 Sparse kernels are written DHWIO = (z, y, x, in, out), without version metadata: OpenPCDet and DSVT turn them on loading
 because the shape differs from the model's, mmdetection3d (with spconv 2 and with mmcv's own operators) expects them.
@@ -79,9 +79,11 @@ class LayoutOptions:
                 raise LayoutError(f"{framework}: prefix and dynamic_pillars must be left out, they are mmdetection3d's")
             return LayoutOptions(stride1_conv=conv_here if self.stride1_conv is None else self.stride1_conv)
         is_dsvt = kind_of(shapes) == "dsvt"
-        if is_dsvt and self.dynamic_pillars:
+        if kind_of(shapes) != "pillars" and self.dynamic_pillars:
             raise LayoutError(
                 "mmdet3d: dynamic_pillars must be left out for DSVT, whose project has a pillar network of its own"
+                if is_dsvt
+                else "mmdet3d: dynamic_pillars must be left out for voxels, which have no pillar network"
             )
         return LayoutOptions(
             stride1_conv=self.stride1_conv if self.stride1_conv is not None else not is_dsvt,
@@ -302,14 +304,14 @@ def shared_cause(found: Shapes, wanted: Shapes) -> str | None:
     """Why hardly any name of a file is one of the model's: a prefix too many or too few, or another framework."""
     same = len(found.keys() & wanted.keys())
     best, cause = same, None
-    for prefix in sorted({name[: match.end()] for name in found for match in re.finditer(r"\.", name)}, key=len):
+    for prefix in sorted({part for name in found for part in _prefixes(name)}, key=len):
         stripped = {name.removeprefix(prefix) for name in found if name.startswith(prefix)}
         if len(stripped & wanted.keys()) > best:
             best, cause = (
                 len(stripped & wanted.keys()),
                 f"probable cause: the file's names have a prefix '{prefix}' too many",
             )
-    for prefix in sorted({name[: match.end()] for name in wanted for match in re.finditer(r"\.", name)}, key=len):
+    for prefix in sorted({part for name in wanted for part in _prefixes(name)}, key=len):
         added = {prefix + name for name in found}
         if len(added & wanted.keys()) > best:
             best, cause = len(added & wanted.keys()), f"probable cause: the file's names lack the prefix '{prefix}'"
@@ -320,13 +322,21 @@ def shared_cause(found: Shapes, wanted: Shapes) -> str | None:
     return cause
 
 
+def _prefixes(name: str) -> list[str]:
+    """``pts_`` and whatever ends with a dot."""
+    dots = [name[: match.end()] for match in re.finditer(r"\.", name)]
+    return [*dots, *(f"{dot}pts_" for dot in ["", *dots] if name.startswith(f"{dot}pts_"))]
+
+
 def framework_of(names: Collection[str]) -> str | None:
-    """ "OpenPCDet" (names of DSVT and of this package too) or "mmdetection3d", by the modules; None: neither."""
-    modules = {name.split(".")[0] for name in names}
-    if modules & {*ENCODER_MODULES}:
-        return "OpenPCDet"
-    if modules & {*MMDET3D_MODULES, *(f"pts_{module}" for module in MMDET3D_MODULES)}:
-        return "mmdetection3d"
+    """ "OpenPCDet" (names of DSVT and of this package too) or "mmdetection3d", by the modules; None: neither. The
+    modules may stand behind one more, such as ``module.``."""
+    for depth in (0, 1):
+        modules = {part for name in names for part in name.split(".")[depth : depth + 1]}
+        if modules & {*ENCODER_MODULES}:
+            return "OpenPCDet"
+        if modules & {*MMDET3D_MODULES, *(f"pts_{module}" for module in MMDET3D_MODULES)}:
+            return "mmdetection3d"
     return None
 
 

@@ -168,14 +168,19 @@ def export(arguments: list[str]) -> None:
         parser.add_argument(
             "--recalibrate-scans",
             type=int,
-            default=RECALIBRATION_SCANS,
-            help="whole scans that batch normalisation gets its statistics from",
+            help=f"whole scans that batch normalisation gets its statistics from (default: {RECALIBRATION_SCANS})",
         )
         parser.add_argument(
             "--no-recalibrate", action="store_true", help="keep the statistics of the training, which saw masked scans"
         )
         parser.add_argument(
             "--parts", default=",".join(ENCODER_MODULES), help="modules to write, with commas; all by default"
+        )
+        parser.add_argument(
+            "--against",
+            metavar="NAMES",
+            type=Path,
+            help="write nothing unless this model would take every tensor; NAMES as with --check",
         )
         _add_layout_options(parser)
 
@@ -186,15 +191,19 @@ def export(arguments: list[str]) -> None:
         arguments,
         add_options,
     )
+    if options.no_recalibrate and options.recalibrate_scans is not None:
+        raise ValueError("export: --recalibrate-scans must be left out with --no-recalibrate")
+    scans = RECALIBRATION_SCANS if options.recalibrate_scans is None else options.recalibrate_scans
     run_export(
         config,
         Path(options.folder),
         options.to,
         options.out,
         checkpoint=options.checkpoint,
-        recalibrate_scans=None if options.no_recalibrate else options.recalibrate_scans,
+        recalibrate_scans=None if options.no_recalibrate else scans,
         parts=options.parts.split(","),
         options=_layout_options(options),
+        against=options.against,
     )
 
 

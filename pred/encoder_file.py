@@ -14,15 +14,18 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import re
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor, nn
 
-from pred.checkpoint import CheckpointError, load_tensors, save_tensors, write_text
+from pred.checkpoint import TEMPORARY_SUFFIX, CheckpointError, load_tensors, save_tensors, write_text
 from pred.checkpoint_layouts import (
     ENCODER_MODULES,
     FRAMEWORKS,
@@ -35,6 +38,7 @@ from pred.checkpoint_layouts import (
     framework_of,
     import_state,
     is_stride1_deblock,
+    kind_of,
     shapes_of,
 )
 from pred.config import plain
@@ -91,7 +95,12 @@ def sidecar(path: Path) -> Path:
 
 
 def encoder_facts(
-    config: PretrainConfig, encoder: nn.Module, step: int, batch_norm: Mapping[str, Any]
+    config: PretrainConfig,
+    encoder: nn.Module,
+    step: int,
+    batch_norm: Mapping[str, Any],
+    trained_with: Mapping[str, Any] | None = None,
+    imported: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """What a user of an encoder's weights must know, as plain values.
 
@@ -100,26 +109,42 @@ def encoder_facts(
         encoder: its encoder.
         step: steps it was trained for.
         batch_norm: where its running statistics come from.
+        trained_with: versions of the training; None: those of this process.
+        imported: where the weights come from if this package did not train them (`load_encoder`). What that file does
+            not say of its training is None.
     """
     data = config.data
-    return {
-        "encoder": type(encoder).__name__,
-        "encoder_kind": config.encoder.kind,
-        "encoder_config": _used_config(config.encoder),
+    training: dict[str, Any] = {
         "dataset": data.dataset,
         "split": data.split,
-        "point_range_m": [float(value) for value in config.point_range],
-        "voxel_size_m": [float(size) for size in encoder.voxel_size],  # type: ignore[union-attr]
-        "point_channels": {name: CHANNEL_UNITS[name.split("_")[0]] for name in data.point_channels},
-        "time_unit": "s",
         "sweeps": data.sweeps,
         "mask_ratio": data.mask_ratio,
         "mask_strategy": data.mask_strategy,
         "step": step,
         "seed": config.train.seed,
+        "trained_with": dict(environment()["versions"] if trained_with is None else trained_with),
+    }
+    if imported is not None:
+        training = {name: imported["facts"].get(name) for name in training}
+        training["imported"] = dict(imported)
+    return {
+        "encoder": type(encoder).__name__,
+        "encoder_kind": config.encoder.kind,
+        "encoder_config": _used_config(config.encoder),
+        **_input_facts(config, encoder),
+        **training,
         "batch_norm": dict(batch_norm),
-        "versions": environment()["versions"],
-        "caveats": [*_caveats(config, batch_norm)],
+        "written_with": environment()["versions"],
+        "caveats": [*_caveats(config, batch_norm, training["mask_ratio"])],
+    }
+
+
+def _input_facts(config: PretrainConfig, encoder: nn.Module) -> dict[str, Any]:
+    return {
+        "point_range_m": [float(value) for value in config.point_range],
+        "voxel_size_m": [float(size) for size in encoder.voxel_size],  # type: ignore[union-attr]
+        "point_channels": {name: CHANNEL_UNITS[name.split("_")[0]] for name in config.data.point_channels},
+        "time_unit": "s",
     }
 
 
@@ -131,7 +156,7 @@ def _used_config(encoder: EncoderConfig) -> dict[str, Any]:
     return {name: value for name, value in plain(encoder).items() if name in ("kind", "bev", *parts)}
 
 
-def _caveats(config: PretrainConfig, batch_norm: Mapping[str, Any]) -> list[str]:
+def _caveats(config: PretrainConfig, batch_norm: Mapping[str, Any], mask_ratio: float | None) -> list[str]:
     encoder = config.encoder
     caveats = [
         "x, y, z are in the LiDAR frame of the data set, and intensity has its scale: a pipeline with others feeds the "
@@ -150,9 +175,10 @@ def _caveats(config: PretrainConfig, batch_norm: Mapping[str, Any]) -> list[str]
             "OpenPCDet's and DSVT's adam_onecycle never updates in_proj_weight and in_proj_bias of attention"
         )
     if batch_norm.get("masked"):
+        share = "most" if mask_ratio is None else f"{mask_ratio:.0%}"
         caveats.append(
-            f"the running statistics of batch normalisation are those of scans of which {config.data.mask_ratio:.0%} "
-            "of the points are hidden; `pred export` takes them from whole scans"
+            f"the running statistics of batch normalisation are those of scans of which {share} of the points are "
+            "hidden; `pred export` takes them from whole scans"
         )
     return caveats
 
@@ -179,16 +205,12 @@ def write_encoder(
         The sidecar's content.
 
     Raises:
-        LayoutError: the framework has no place for a tensor, or a weight is not finite.
-        CheckpointError: the folder does not exist.
+        LayoutError: the framework has no place for a tensor, or a weight is not finite; unknown or empty parts.
+        CheckpointError: the folder does not exist, or FILE or FILE.json is something else.
     """
-    if not path.parent.is_dir():
-        raise CheckpointError(f"{path}: folder must exist, got none")
+    require_place(path)
     state, conv_here = encoder.state_dict(), has_conv_for_no_stride(encoder)
-    unknown = sorted({*parts} - {name.split(".")[0] for name in state})
-    if unknown and {*parts} != {*ENCODER_MODULES}:
-        raise LayoutError(f"parts must be modules of the encoder, got {', '.join(unknown)}")
-    chosen = {name: tensor for name, tensor in state.items() if name.split(".")[0] in parts}
+    chosen = choose_parts(state, parts)
     exported = export_state(chosen, to, options, conv_here)
     resolved = (options or LayoutOptions()).resolved(shapes_of(chosen), to, conv_here)
     layout: dict[str, Any] = {
@@ -203,13 +225,21 @@ def write_encoder(
         "options": asdict(resolved),
         "use_conv_for_no_stride": resolved.stride1_conv,
     }
+    if to == "mmdet3d" and kind_of(state) == "pillars":
+        layout["pillar_network"] = _mmdet3d_pillars(shapes_of(chosen), resolved)
     content = {**facts, "layout": layout}
-    # While the file is replaced there is none of the old facts beside it.
-    sidecar(path).unlink(missing_ok=True)
-    save_tensors(path, {WRAPPERS[to]: exported, FACTS: content})
+    new = path.with_name(f".{path.name}.new{TEMPORARY_SUFFIX}")
+    try:
+        save_tensors(new, {WRAPPERS[to]: exported, FACTS: content})
+        sha256 = _sha256(new)
+        sidecar(path).unlink(missing_ok=True)  # never the old facts beside the new file
+        os.replace(new, path)
+    except BaseException:
+        new.unlink(missing_ok=True)
+        raise
     described = {
         **content,
-        "sha256": _sha256(path),
+        "sha256": sha256,
         "tensors": {
             name: {"shape": list(tensor.shape), "dtype": str(tensor.dtype).removeprefix("torch.")}
             for name, tensor in exported.items()
@@ -217,6 +247,50 @@ def write_encoder(
     }
     write_text(sidecar(path), json.dumps(described, indent=2) + "\n")
     return described
+
+
+def require_place(path: Path) -> None:
+    """
+    Raises:
+        CheckpointError: a file of weights and its sidecar cannot be written, or would replace something else.
+    """
+    if not path.name or path.is_dir():
+        raise CheckpointError(f"{path}: must be a file to write, got a folder")
+    if not path.parent.is_dir():
+        raise CheckpointError(f"{path}: folder must exist, got none")
+    if sidecar(path).exists() and _described_sha256(path) is None:
+        raise CheckpointError(f"{sidecar(path)}: must be absent or of `pred export`, got another file")
+
+
+def choose_parts(state: Mapping[str, Any], parts: Collection[str]) -> dict[str, Any]:
+    """Of an encoder's names those in some of its modules. Modules without tensors may be asked for.
+
+    Raises:
+        LayoutError: no encoder has such a module, or nothing remains.
+    """
+    unknown = sorted({*parts} - {*ENCODER_MODULES})
+    if unknown:
+        raise LayoutError(f"parts must be of {', '.join(ENCODER_MODULES)}, got {', '.join(unknown)}")
+    chosen = {name: value for name, value in state.items() if name.split(".")[0] in parts}
+    if not chosen:
+        modules = sorted({name.split(".")[0] for name in state})
+        raise LayoutError(
+            f"parts must name modules with weights, {', '.join(modules)}, got {', '.join(parts) or 'none'}"
+        )
+    return chosen
+
+
+def _mmdet3d_pillars(shapes: Mapping[str, tuple[int, ...]], options: LayoutOptions) -> dict[str, Any]:
+    """What the configuration of mmdetection3d's pillar network must say for these weights, and no shape tells."""
+    widths = [shape[0] for name, shape in shapes.items() if re.fullmatch(r"vfe\.pfn_layers\.\d+\.linear\.weight", name)]
+    if options.dynamic_pillars:  # layers but the last are not halved there
+        return {"type": "DynamicPillarFeatureNet", "feat_channels": widths, "legacy": False}
+    # As OpenPCDet, all layers but the last have half as many channels as are said.
+    return {
+        "type": "PillarFeatureNet",
+        "feat_channels": [2 * width for width in widths[:-1]] + widths[-1:],
+        "legacy": False,
+    }
 
 
 def read_weights(path: Path) -> WeightsFile:
@@ -244,9 +318,16 @@ def read_weights(path: Path) -> WeightsFile:
                 f"keys {', '.join(map(str, content)) or 'none'}{hint}"
             )
         state = content
+    if not state:
+        raise CheckpointError(f"{path}: must hold weights, got none")
     for name, value in state.items():
+        if not isinstance(name, str):
+            raise CheckpointError(f"{path}: names of weights must be text, got {name!r}")
         if not isinstance(value, Tensor):
             raise CheckpointError(f"{path}: weights must be tensors, got {type(value).__name__} as {name}")
+        if value.layout != torch.strided or value.is_meta or value.is_quantized:
+            kind = "quantized" if value.is_quantized else "meta" if value.is_meta else str(value.layout)
+            raise CheckpointError(f"{path}: weights must be dense tensors with values, got a {kind} one as {name}")
     facts = content.get(FACTS)
     return WeightsFile(path, dict(state), facts if isinstance(facts, dict) else {})
 
@@ -256,31 +337,38 @@ def load_encoder(
     path: Path,
     options: LayoutOptions | None = None,
     kernel_order: KernelOrder | None = None,
+    config: PretrainConfig | None = None,
 ) -> dict[str, Any]:
     """Give an encoder the weights in a checkpoint of OpenPCDet, DSVT, mmdetection3d or this package, all or none.
 
-    Heads of detectors in the file are left out. What this package wrote says itself how it is to be read.
+    Heads of detectors in the file are left out. What this package wrote says itself how it is to be read, and for which
+    input.
 
     Args:
         encoder: gets the weights.
         path: the checkpoint.
         options: of the framework's configuration, where names and shapes do not tell; see `LayoutOptions`.
         kernel_order: of the sparse kernels, where shapes do not tell.
+        config: that the encoder was built from; the input that the file was trained for must be its input.
 
     Returns:
         Where the weights come from: file, SHA-256, framework, number of tensors, modules left out, and the facts that
         stand in the file.
 
     Raises:
-        CheckpointError: the file cannot be read, or its encoder is not this one; the text names each difference and
-            its probable cause.
+        CheckpointError: the file cannot be read, its encoder is not this one, or it says otherwise than the arguments;
+            the text names each difference and its probable cause.
     """
     file = read_weights(path)
     written = file.facts.get("layout")
     framework: Framework = "mmdet3d" if framework_of(file.state) == "mmdetection3d" else "openpcdet"
     if isinstance(written, dict) and written.get("framework") in FRAMEWORKS:
-        kernel_order = kernel_order or "dhwio"
-        options = options or _written_options(written)
+        if kernel_order == "krsc":
+            raise CheckpointError(f"{path}: --kernel-order must be dhwio, as the file says, got krsc")
+        kernel_order = "dhwio"
+        options = _agreed_options(path, options or LayoutOptions(), written.get("options", {}))
+    if config is not None:
+        _require_same_input(path, file.facts, _input_facts(config, encoder))
     heads = {name for name in file.state if name.split(".")[0] in HEADS}
     state = {name: tensor for name, tensor in file.state.items() if name not in heads}
     try:
@@ -305,17 +393,68 @@ def load_encoder(
     }
 
 
-def _written_options(layout: Mapping[str, Any]) -> LayoutOptions | None:
-    written = layout.get("options")
-    return LayoutOptions(**written) if isinstance(written, dict) else None
+_OPTION_FLAGS = {
+    "stride1_conv": "--stride1-deblock",
+    "prefix": "--mmdet3d-prefix",
+    "dynamic_pillars": "--dynamic-pillars",
+}
+_OPTION_VALUES = {"stride1_conv": (None, True, False), "prefix": (None, "pts_", ""), "dynamic_pillars": (True, False)}
+
+
+def _agreed_options(path: Path, asked: LayoutOptions, written: Any) -> LayoutOptions:
+    """Those that the file says, where nothing else was asked for."""
+    if not isinstance(written, dict):
+        raise CheckpointError(f"{path}: layout.options must be a dictionary, got {type(written).__name__}")
+    for name, value in written.items():
+        allowed = _OPTION_VALUES.get(name, ())
+        if not any(type(value) is type(other) and value == other for other in allowed):
+            raise CheckpointError(f"{path}: layout.options must be those of `pred export`, got {name} = {value!r}")
+    file = LayoutOptions(**written)
+    unsaid = LayoutOptions()
+    for name, flag in _OPTION_FLAGS.items():
+        want, have = getattr(asked, name), getattr(file, name)
+        if want not in (getattr(unsaid, name), have) and have is not None:
+            raise CheckpointError(f"{path}: {flag} must be left out or say what the file says ({name} = {have!r})")
+    return file if file.stride1_conv is not None else replace(file, stride1_conv=asked.stride1_conv)
+
+
+def _require_same_input(path: Path, facts: Mapping[str, Any], here: Mapping[str, Any]) -> None:
+    """Weights mean something else for other cells, heights or channels, and no shape tells."""
+    for name in ("voxel_size_m", "point_channels", "time_unit"):
+        there = facts.get(name)
+        if there is not None and not _alike(there, here[name]):
+            raise CheckpointError(
+                f"{path}: {name} must be that of the encoder, {_said(here[name])}, got {_said(there)}"
+            )
+    there = facts.get("point_range_m")
+    z = [here["point_range_m"][axis] for axis in (2, 5)]
+    if isinstance(there, list) and len(there) == 6 and not _alike([there[2], there[5]], z):
+        raise CheckpointError(
+            f"{path}: point_range_m must be that of the encoder in z, {z}, got {[there[2], there[5]]}"
+        )
+
+
+def _alike(a: Any, b: Any) -> bool:
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return list(a) == list(b)  # channels in their order
+    return bool(a == b)
+
+
+def _said(value: Any) -> str:
+    return ", ".join(value) if isinstance(value, Mapping) else str(value)
+
+
+def _described_sha256(path: Path) -> Any:
+    """What the sidecar says; None where it is not one of this package."""
+    try:
+        return json.loads(sidecar(path).read_text())["sha256"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _require_sidecar(path: Path) -> None:
-    try:
-        expected = json.loads(sidecar(path).read_text())["sha256"]
-    except (ValueError, KeyError, TypeError):
-        return  # not one of this package
-    if expected != _sha256(path):
+    expected = _described_sha256(path)
+    if expected is not None and expected != _sha256(path):
         raise CheckpointError(f"{path}: must be the file that {sidecar(path).name} describes, got another SHA-256")
 
 

@@ -185,7 +185,10 @@ def evaluate_probe(
         "root": config.data.root,
         "train_split": train_split,
         "val_split": val_split,
-        "val_frames_encoder_trained_on": len(val_tokens & trained_tokens(folder, config.data)),
+        # Nobody knows which frames imported weights have seen.
+        "val_frames_encoder_trained_on": None
+        if folder.is_imported()
+        else len(val_tokens & trained_tokens(folder, config.data)),
         "cells_per_frame": cells_per_frame,
         "train_frames": len(classes),
         "val_frames": num_val_frames,

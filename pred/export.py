@@ -9,6 +9,8 @@ command that reads a run can use. `pred.checkpoint_layouts` holds the tables, `p
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,18 +21,36 @@ from torch import Tensor
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from pred import __version__
-from pred.checkpoint import load_tensors, save_checkpoint
-from pred.checkpoint_layouts import ENCODER_MODULES, Framework, KernelOrder, LayoutOptions, layout, shapes_of
+from pred.checkpoint import TEMPORARY_SUFFIX, load_tensors, save_checkpoint
+from pred.checkpoint_layouts import (
+    ENCODER_MODULES,
+    Framework,
+    KernelOrder,
+    LayoutOptions,
+    export_state,
+    is_stride1_deblock,
+    layout,
+    shapes_of,
+)
 from pred.config import plain, to_yaml
 from pred.data.batch import build_source
 from pred.data.frame import FrameError
-from pred.encoder_file import encoder_facts, has_conv_for_no_stride, load_encoder, sidecar, write_encoder
+from pred.encoder_file import (
+    choose_parts,
+    encoder_facts,
+    has_conv_for_no_stride,
+    load_encoder,
+    require_place,
+    sidecar,
+    write_encoder,
+)
 from pred.evaluate import SpreadFrames, load_frames
 from pred.evaluate_probe import whole_scan
+from pred.export_check import require_match, specs_of
 from pred.models.pretrainer import Pretrainer
 from pred.pretrain import PretrainConfig, build_model, load_model, pick_device, recalibrate_batch_norm
 from pred.progress import Progress
-from pred.run_folder import RunFolder
+from pred.run_folder import RunFolder, RunFolderError
 
 RECALIBRATION_SCANS = 64
 
@@ -44,6 +64,7 @@ def export(
     recalibrate_scans: int | None = RECALIBRATION_SCANS,
     parts: Collection[str] = ENCODER_MODULES,
     options: LayoutOptions | None = None,
+    against: Path | None = None,
 ) -> dict[str, Any]:
     """Write the encoder of a run as a framework loads it, and FILE.json beside it.
 
@@ -57,6 +78,7 @@ def export(
             normalisation; None keeps those of the checkpoint.
         parts: modules that are written.
         options: of the framework's configuration.
+        against: names, shapes and types of a model (`pred.export_check.read_specs`), whose encoder must take all.
 
     Returns:
         What FILE.json holds.
@@ -69,17 +91,26 @@ def export(
         raise ValueError(f"export: recalibrate-scans must be at least 1, got {recalibrate_scans}")
     folder = RunFolder(run)
     folder.require()
+    # What cannot be written is refused before the long work.
+    require_place(out)
+    if out.resolve().is_relative_to(folder.checkpoints.resolve()) or out.resolve() == folder.encoder.resolve():
+        raise ValueError(f"export: out must not replace what the run made, got {out}")
     model, checkpoint = load_model(config, folder, checkpoint)
-    # What the framework has no place for is refused before the long work.
-    layout(_chosen(model, parts), to, options, has_conv_for_no_stride(model.encoder))
+    conv_here = has_conv_for_no_stride(model.encoder)
+    shapes = choose_parts(shapes_of(model.encoder.state_dict()), parts)
+    entries = layout(shapes, to, options, conv_here)
+    if against is not None:
+        require_match(
+            specs_of(export_state(choose_parts(model.encoder.state_dict(), parts), to, options, conv_here)), against
+        )
     state = load_tensors(checkpoint)
     batch_norm: dict[str, Any] = state.get("batch_norm", {"source": "checkpoint", "masked": True})
     if recalibrate_scans is not None:
         batch_norm = recalibrate_on_whole_scans(model, config, recalibrate_scans)
-    facts = encoder_facts(config, model.encoder, state["step"], batch_norm)
+    facts = encoder_facts(
+        config, model.encoder, state["step"], batch_norm, state.get("versions", {}), state.get("imported")
+    )
     facts["checkpoint"] = checkpoint.name
-    if "imported" in state:
-        facts["imported"] = state["imported"]
     content = write_encoder(out, model.encoder, facts, to, options, parts)
     layout_facts = content["layout"]
     print(f"wrote {out} and {sidecar(out).name}: {layout_facts['num_tensors']} tensors for {to}")
@@ -90,6 +121,9 @@ def export(
         print(f"  {folded} biases folded into running means")
     for module in layout_facts["left_out"]:
         print(f"  {module:<20} left out")
+    if any(is_stride1_deblock(entry.ours, entry.shape) for entry in entries):
+        kind = "Conv2d" if layout_facts["use_conv_for_no_stride"] else "ConvTranspose2d"
+        print(f"  deblocks of stride 1 are for {kind}; --stride1-deblock says it if the model has the other")
     return content
 
 
@@ -170,14 +204,13 @@ def import_encoder(
 
     Raises:
         CheckpointError: the file cannot be read, or its encoder is not this one; the text names each difference.
-        RunFolderError: the folder holds a run.
+        RunFolderError: the folder holds something.
     """
+    if out.is_dir() and any(out.iterdir()) or out.exists() and not out.is_dir():
+        raise RunFolderError(f"{out}: run folder must be new, got one that holds something, or a file")
     config = replace(config, run=str(out))
     model = build_model(config)
-    imported = load_encoder(model.encoder, file, options, kernel_order)
-    folder = RunFolder(out)
-    folder.start(to_yaml(config))
-    folder.record_start({"imported": imported}, None)
+    imported = load_encoder(model.encoder, file, options, kernel_order, config)
     batch_norm = imported["facts"].get("batch_norm", {"source": str(file), "masked": False})
     state = {
         "model": model.state_dict(),
@@ -186,15 +219,20 @@ def import_encoder(
         "config": plain(config),
         "versions": {"pred": __version__, "torch": str(torch.__version__)},
     }
-    save_checkpoint(folder.checkpoints, 0, state, keep_last=1)
-    facts = encoder_facts(config, model.encoder, 0, batch_norm) | {"imported": imported}
-    write_encoder(folder.encoder, model.encoder, facts)
+    # A folder is there with all of it, or not at all: half of one could be taken for a run before its first checkpoint.
+    out.parent.mkdir(parents=True, exist_ok=True)
+    folder = RunFolder(out.with_name(f".{out.name}{TEMPORARY_SUFFIX}"))
+    shutil.rmtree(folder.path, ignore_errors=True)  # of an import that was killed
+    try:
+        folder.start(to_yaml(config))
+        folder.record_start({"imported": imported}, None)
+        save_checkpoint(folder.checkpoints, 0, state, keep_last=1)
+        facts = encoder_facts(config, model.encoder, 0, batch_norm, imported=imported)
+        write_encoder(folder.encoder, model.encoder, facts)
+        os.replace(folder.path, out)
+    finally:
+        shutil.rmtree(folder.path, ignore_errors=True)
     print(f"imported {imported['num_tensors']} tensors of {imported['framework']} from {file} into {out}")
     if imported["left_out"]:
         print(f"  left out: {', '.join(imported['left_out'])}")
     return imported
-
-
-def _chosen(model: Pretrainer, parts: Collection[str]) -> dict[str, tuple[int, ...]]:
-    shapes = shapes_of(model.encoder.state_dict())
-    return {name: shape for name, shape in shapes.items() if name.split(".")[0] in parts}

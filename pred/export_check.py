@@ -96,17 +96,33 @@ def check_file(file: Path, against: Path, only: Collection[str] | None = None) -
     Raises:
         CheckpointError: a file cannot be read, or the weights do not fit.
     """
-    found, wanted = specs_of(read_weights(file).state), read_specs(against)
-    comparison = compare(found, wanted, only)
+    comparison = compare(specs_of(read_weights(file).state), read_specs(against), only)
     print(report(comparison))
-    if not comparison.complete:
-        matched, total = comparison.matched.total(), comparison.wanted.total()
-        left_over = sum(problem.kind == "left over" for problem in comparison.problems)
-        raise CheckpointError(
-            f"{file}: must hold the {total} tensors of {against} and no others, got {matched} of them and "
-            f"{left_over} others"
-        )
+    _require_complete(comparison, file, against)
     return comparison
+
+
+def require_match(found: Mapping[str, Spec], against: Path) -> None:
+    """Tensors that are about to be written must be those of a model's encoder.
+
+    Raises:
+        CheckpointError: they are not; the text says what differs.
+    """
+    comparison = compare(found, read_specs(against))
+    if not comparison.complete:
+        print(report(comparison))
+    _require_complete(comparison, "export", against)
+
+
+def _require_complete(comparison: Comparison, what: object, against: Path) -> None:
+    if comparison.complete:
+        return
+    matched, total = comparison.matched.total(), comparison.wanted.total()
+    left_over = sum(problem.kind == "left over" for problem in comparison.problems)
+    raise CheckpointError(
+        f"{what}: must hold the {total} tensors of {against} and no others, got {matched} of them and {left_over} "
+        "others"
+    )
 
 
 def compare(found: Mapping[str, Spec], wanted: Mapping[str, Spec], only: Collection[str] | None = None) -> Comparison:
@@ -121,7 +137,7 @@ def compare(found: Mapping[str, Spec], wanted: Mapping[str, Spec], only: Collect
         ValueError: a module of ``only`` is in neither.
     """
     modules = {_module(name) for name in (*found, *wanted)}
-    if only is not None and (unknown := sorted({*only} - modules)):
+    if only is not None and (unknown := sorted({*only} - modules - {*MODULES})):
         raise ValueError(
             f"export: --only must name modules of FILE or NAMES, {', '.join(sorted(modules))}; got {', '.join(unknown)}"
         )
@@ -148,7 +164,7 @@ def compare(found: Mapping[str, Spec], wanted: Mapping[str, Spec], only: Collect
             text = f"must be {spec}, got {got}: weights of another type are rounded on loading"
             comparison.problems.append(Problem("type", name, text))
         elif is_sparse_kernel(name, spec.shape) and not turns_by_shape:
-            problem = _mmdet3d_kernel(got.shape, spec.shape)
+            problem = _mmdet3d_kernel(name, got.shape, spec.shape)
             if problem is None:
                 comparison.matched[_module(name)] += 1
             else:
@@ -185,13 +201,27 @@ def report(comparison: Comparison) -> str:
     if comparison.cause:
         lines.append(comparison.cause)
     for (kind, module), problems in _by_module(comparison.problems).items():
+        left_over = {_module(problem.name) for problem in comparison.problems if problem.kind == "left over"}
         whole = len(problems) == comparison.wanted[module] if kind == "missing" else module not in comparison.wanted
-        if whole and kind in ("missing", "left over"):
+        if whole and kind == "missing" and module in left_over:
+            lines.append(
+                f"{kind:<9} {module}: all {len(problems)} tensors; the file has others of {module}{_other(problems)}"
+            )
+        elif whole and kind in ("missing", "left over"):
             side = "the file holds" if kind == "missing" else "the model has"
             lines.append(f"{kind:<9} {module}: all {len(problems)} tensors; {side} nothing of {module}")
         else:
             lines += [f"{kind:<9} {problem.name} {problem.text}" for problem in problems]
     return "\n".join(lines)
+
+
+def _other(problems: list[Problem]) -> str:
+    """Why a module of the model has all its tensors under other names."""
+    if any(re.search(r"pfn_layers\.\d+\.[01]\.", problem.name) for problem in problems):
+        return ": the model is a DynamicPillarFeatureNet, the file for a PillarFeatureNet (--dynamic-pillars)"
+    if any(re.search(r"pfn_layers\.\d+\.(linear|norm)\.", problem.name) for problem in problems):
+        return ": the model is a PillarFeatureNet, the file for a DynamicPillarFeatureNet"
+    return ""
 
 
 def _by_module(problems: list[Problem]) -> dict[tuple[str, str], list[Problem]]:
@@ -216,6 +246,8 @@ def read_specs(path: Path) -> dict[str, Spec]:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise CheckpointError(f"{path}: must exist, got no such file") from None
+    except IsADirectoryError:
+        raise CheckpointError(f"{path}: must be a list of names or a checkpoint, got a folder") from None
     except UnicodeDecodeError:
         return specs_of(read_weights(path).state)
     specs: dict[str, Spec] = {}
@@ -226,6 +258,8 @@ def read_specs(path: Path) -> dict[str, Spec]:
         match = _LINE.fullmatch(line)
         if match is None:
             raise CheckpointError(f"{path}: line {number} must be `name (shape) dtype`, got {line[:80]!r}")
+        if match[1] in specs:
+            raise CheckpointError(f"{path}: line {number} must name another tensor, got {match[1]} again")
         specs[match[1]] = Spec(tuple(int(size) for size in re.findall(r"\d+", match[2])), match[3])
     if not specs:
         raise CheckpointError(f"{path}: must name tensors, got none")
@@ -240,7 +274,7 @@ def _dhwio(shape: Shape) -> Shape:
     return tuple(shape[axis] for axis in KRSC_TO_DHWIO)
 
 
-def _mmdet3d_kernel(got: Shape, wanted: Shape) -> str | None:
+def _mmdet3d_kernel(name: str, got: Shape, wanted: Shape) -> str | None:
     """mmdetection3d turns every kernel on loading if it uses spconv 2, and none if it uses mmcv's operators, and a file
     has to be (z, y, x, in, out) for both; its own list of shapes is (out, z, y, x, in) in the first case."""
     # Kernels are 3 or 1 cells long, and have more channels than that but where they begin or end.
@@ -248,7 +282,7 @@ def _mmdet3d_kernel(got: Shape, wanted: Shape) -> str | None:
     dhwio = _dhwio(wanted) if is_krsc else wanted
     if got == dhwio:
         return None
-    cause = cause_of_shape("", got, dhwio)
+    cause = cause_of_shape(name, got, dhwio)
     if is_krsc and got == wanted:
         cause = ": (out, z, y, x, in), which mmdetection3d turns once more on loading"
     return f"must be ({', '.join(map(str, dhwio))}), got ({', '.join(map(str, got))}){cause}"

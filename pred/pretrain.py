@@ -200,7 +200,7 @@ def pretrain(config: PretrainConfig, resume: bool = False) -> Path:
     model = build_model(config)
     initial = None
     if config.init_encoder is not None and not (resume and list_checkpoints(folder.checkpoints)):
-        initial = load_encoder(model.encoder, Path(config.init_encoder))
+        initial = load_encoder(model.encoder, Path(config.init_encoder), config=config)
     digest = frames_digest(source)
 
     latest = None
@@ -376,6 +376,8 @@ def load_model(config: PretrainConfig, folder: RunFolder, checkpoint: Path | Non
         checkpoint, state = latest.path, latest.state
     else:
         state = load_tensors(checkpoint)
+    if "model" not in state:
+        raise CheckpointError(f"{checkpoint}: must be a checkpoint of a run, got the keys {', '.join(map(str, state))}")
     model = build_model(config)
     try:
         model.load_state_dict(state["model"])

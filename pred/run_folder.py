@@ -94,6 +94,10 @@ class RunFolder:
         if not self.config.is_file():
             raise RunFolderError(f"{self.path}: run folder must hold config.yaml, got none: no run was started here")
 
+    def is_imported(self) -> bool:
+        """Whether the weights come from elsewhere (`pred import`), not from a training here."""
+        return self.info.is_file() and "imported" in json.loads(self.info.read_text())
+
     def record_start(self, facts: Mapping[str, Any], resumed_step: int | None) -> None:
         """Add this process to run.json; a resumed run keeps the record of its first start."""
         record = {

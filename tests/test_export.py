@@ -12,6 +12,7 @@ import re
 import signal
 import time
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from pred import cli, encoder_file
 from pred.checkpoint import CheckpointError, list_checkpoints, load_tensors, save_tensors
-from pred.checkpoint_layouts import FRAMEWORKS, LayoutError, export_state, import_state, shapes_of
+from pred.checkpoint_layouts import FRAMEWORKS, LayoutError, LayoutOptions, export_state, import_state, shapes_of
 from pred.config import build, config_names, config_parser
 from pred.data.batch import build_source
 from pred.data.frame import Frame
@@ -174,7 +175,8 @@ def test_the_sidecar_says_what_a_user_must_know(run: Path, tmp_path: Path) -> No
     assert facts["point_range_m"] == [-25.6, -25.6, -3.0, 25.6, 25.6, 3.0] and facts["voxel_size_m"] == [0.8, 0.8, 6.0]
     assert (facts["dataset"], facts["sweeps"], facts["step"], facts["seed"]) == ("nuscenes", 1, 3, 0)
     assert (facts["mask_ratio"], facts["mask_strategy"]) == (0.8, "point")
-    assert facts["versions"]["torch"] == torch.__version__ and facts["versions"]["pred"]
+    assert facts["trained_with"]["torch"] == facts["written_with"]["torch"] == torch.__version__
+    assert facts["layout"]["pillar_network"] == {"type": "PillarFeatureNet", "feat_channels": [16, 16], "legacy": False}
     assert facts["encoder_kind"] == "pillars" and set(facts["encoder_config"]) == {
         "kind", "bev", "pillars", "backbone_2d",
     }  # fmt: skip
@@ -194,9 +196,88 @@ def test_parts_are_left_out_only_on_request(run: Path, tmp_path: Path) -> None:
     content = export(config, run, "openpcdet", tmp_path / "a.pth", recalibrate_scans=None, parts=["vfe"])
     assert {name.split(".")[0] for name in content["tensors"]} == {"vfe"}
     assert content["layout"]["left_out"] == ["backbone_2d"]
-    with pytest.raises(LayoutError, match="parts must be modules of the encoder, got backbone_3d"):
-        export(config, run, "openpcdet", tmp_path / "b.pth", recalibrate_scans=None, parts=["vfe", "backbone_3d"])
+    # backbone_3d of pillars and vfe of voxels have no tensors, and may be named.
+    content = export(config, run, "openpcdet", tmp_path / "a.pth", recalibrate_scans=None, parts=["vfe", "backbone_3d"])
+    assert set(content["layout"]["modules"]) == {"vfe"}
+    for parts, text in (
+        (["vfe", "backbone3d"], "parts must be of vfe, backbone_3d, backbone_2d, got backbone3d"),
+        (["backbone_3d"], "parts must name modules with weights, backbone_2d, vfe, got backbone_3d"),
+    ):
+        with pytest.raises(LayoutError, match=text):
+            export(config, run, "openpcdet", tmp_path / "b.pth", parts=parts)
     assert not (tmp_path / "b.pth").exists()
+
+
+def test_where_a_file_may_be_written(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Said before any scan is read."""
+    config = tiny_config(run)
+    (tmp_path / "mine.pth.json").write_text('{"notes": "of the user"}')
+    for out, text in (
+        (tmp_path, "must be a file to write, got a folder"),
+        (Path("."), "must be a file to write, got a folder"),
+        (tmp_path / "none" / "a.pth", "none/a.pth: folder must exist, got none"),
+        (list_checkpoints(run / "checkpoints")[-1], "out must not replace what the run made"),
+        (run / "encoder.pth", "out must not replace what the run made"),
+        (tmp_path / "mine.pth", r"mine\.pth\.json: must be absent or of `pred export`, got another file"),
+    ):
+        with pytest.raises((CheckpointError, ValueError), match=text):
+            export(config, run, "openpcdet", out)
+    assert "recalibrating" not in capsys.readouterr().err
+    assert (tmp_path / "mine.pth.json").read_text() == '{"notes": "of the user"}'
+
+
+def test_a_full_disk_leaves_the_old_file_and_its_facts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, encoder = tmp_path / "encoder.pth", OneLayer(4)
+    write_encoder(path, encoder, {"number": 1})
+    before = path.read_bytes(), sidecar(path).read_bytes()
+
+    def full(*arguments: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_encoder(path, encoder, {"number": 2})
+    assert (path.read_bytes(), sidecar(path).read_bytes()) == before
+    assert {file.name for file in tmp_path.iterdir()} == {"encoder.pth", "encoder.pth.json"}
+
+
+def test_export_against_a_model(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing is written that the model would not take."""
+    names = tmp_path / "names.txt"
+    specs = specs_of(trained_encoder(run))
+    names.write_text("".join(f"{name} {spec}\n" for name, spec in specs.items()))
+    arguments = ["export", str(run), "--to", "openpcdet", "--no-recalibrate", "--against", str(names), "--out"]
+    assert cli.main([*arguments, str(tmp_path / "a.pth")]) == 0
+    lines = names.read_text().splitlines()
+    names.write_text("\n".join(lines[1:]))
+    assert cli.main([*arguments, str(tmp_path / "b.pth")]) == 1
+    name = lines[0].split()[0]
+    assert f"left over {name}" in capsys.readouterr().out and not (tmp_path / "b.pth").exists()
+
+
+def test_options_that_cannot_apply(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["export", str(run), "--to", "mmdet3d", "--out", str(tmp_path / "a.pth")]
+    assert cli.main([*arguments, "--no-recalibrate", "--recalibrate-scans", "5"]) == 1
+    assert "--recalibrate-scans must be left out with --no-recalibrate" in capsys.readouterr().err
+    encoder = Encoder(ENCODERS["voxels"], (-6.4, -6.4, -5.0, 6.4, 6.4, 3.0), point_channels=4)
+    with pytest.raises(LayoutError, match="dynamic_pillars must be left out for voxels"):
+        write_encoder(tmp_path / "a.pth", encoder, {}, "mmdet3d", LayoutOptions(dynamic_pillars=True))
+    assert not (tmp_path / "a.pth").exists()
+    with pytest.raises(
+        CheckpointError, match=r"encoder\.pth: must be a checkpoint of a run, got the keys model_state, pred"
+    ):
+        export(tiny_config(run), run, "dsvt", tmp_path / "a.pth", run / "encoder.pth")
+
+
+def test_dynamic_pillars_say_their_channels(run: Path, tmp_path: Path) -> None:
+    """mmdetection3d's DynamicPillarFeatureNet does not halve the layers before the last."""
+    config = tiny_config(run)
+    encoder = build_model(config).encoder
+    widths = [layer.linear.out_features for layer in encoder.vfe.pfn_layers]  # type: ignore[union-attr]
+    content = write_encoder(tmp_path / "a.pth", encoder, {}, "mmdet3d", LayoutOptions(dynamic_pillars=True))
+    assert content["layout"]["pillar_network"] == {
+        "type": "DynamicPillarFeatureNet", "feat_channels": widths, "legacy": False,
+    }  # fmt: skip
 
 
 def test_a_data_set_that_is_gone_names_the_options(run: Path, tmp_path: Path) -> None:
@@ -393,6 +474,63 @@ def test_each_mistake_is_found_and_explained(mistake: str, tmp_path: Path, capfd
             import_state(exported, shapes_of(state), "openpcdet")
 
 
+@pytest.mark.parametrize(
+    "change,problem,cause",
+    [
+        (
+            lambda s: s | {"pts_middle_encoder.conv_input.0.weight": torch.zeros(3, 3, 3, 3, 16)},
+            "kernel    pts_middle_encoder.conv_input.0.weight must be (3, 3, 3, 4, 16)",
+            "the file is for points of 3 channels, the model for 4",
+        ),
+        (
+            lambda s: {name.removeprefix("pts_"): value for name, value in s.items()},
+            "missing   pts_middle_encoder: all",
+            "the file's names lack the prefix 'pts_'",
+        ),
+        (
+            lambda s: {f"module.{name}": value for name, value in s.items()},
+            "left over module: all",
+            "the file's names have a prefix 'module.' too many",
+        ),
+    ],
+)
+def test_mistakes_in_files_for_mmdetection3d(
+    change: Any, problem: str, cause: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    encoder = Encoder(ENCODERS["voxels"], (-6.4, -6.4, -5.0, 6.4, 6.4, 3.0), point_channels=4)
+    exported = export_state(random_state(specs_of(encoder.state_dict())), "mmdet3d")
+    names = tmp_path / "names.txt"
+    names.write_text("".join(f"{name} {spec}\n" for name, spec in specs_of(exported).items()))
+    assert run_check(tmp_path, exported, names) == 0
+    assert run_check(tmp_path, change(exported), names) == 1
+    output = capfd.readouterr().out
+    assert problem in output and cause in output
+    torch.save({"state_dict": change(exported)}, tmp_path / "wrong.pth")
+    with pytest.raises(
+        CheckpointError, match=f"wrong.pth: mmdet3d: .*{re.escape(cause)}" if "pts_" not in cause else ""
+    ):
+        load_encoder(encoder, tmp_path / "wrong.pth", None if "pts_" not in cause else LayoutOptions(prefix="pts_"))
+
+
+def test_names_of_the_other_pillar_network(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    encoder = Encoder(ENCODERS["pillars"], (-6.4, -6.4, -5.0, 6.4, 6.4, 3.0), point_channels=4)
+    state = random_state(specs_of(encoder.state_dict()))
+    files = [export_state(state, "mmdet3d", LayoutOptions(dynamic_pillars=dynamic)) for dynamic in (False, True)]
+    for file, model, text in (
+        (files[0], files[1], "the model is a DynamicPillarFeatureNet, the file for a PillarFeatureNet"),
+        (files[1], files[0], "the model is a PillarFeatureNet, the file for a DynamicPillarFeatureNet"),
+    ):
+        names = tmp_path / "names.txt"
+        names.write_text("".join(f"{name} {spec}\n" for name, spec in specs_of(model).items()))
+        assert run_check(tmp_path, file, names) == 1
+        assert f"the file has others of pts_voxel_encoder: {text}" in capfd.readouterr().out
+    names.write_text("vfe.a (2) float32\nvfe.a (3) float32\n")
+    with pytest.raises(CheckpointError, match=r"names.txt: line 2 must name another tensor, got vfe\.a again"):
+        read_specs(names)
+    with pytest.raises(CheckpointError, match="must be a list of names or a checkpoint, got a folder"):
+        read_specs(tmp_path)
+
+
 def test_points_of_another_number_of_channels_into_a_pillar_network(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -479,6 +617,125 @@ def test_import_undoes_export(run: Path, tmp_path: Path) -> None:
         assert all(torch.equal(again[name], value) for name, value in trained.items())
     with pytest.raises(RunFolderError, match="must be new"):
         import_encoder(config, tmp_path / "openpcdet.pth", tmp_path / "openpcdet")
+
+
+def test_what_an_import_says_of_the_training(run: Path, tmp_path: Path) -> None:
+    """What the file says; of a file of others nobody knows."""
+    config = tiny_config(run)
+    export(config, run, "openpcdet", tmp_path / "a.pth", recalibrate_scans=None)
+    torch.save({"model_state": read_weights(tmp_path / "a.pth").state}, tmp_path / "bare.pth")
+    here = replace(config, data=replace(config.data, mask_ratio=0.5, sweeps=3), train=replace(config.train, seed=77))
+    names = ("dataset", "sweeps", "mask_ratio", "step", "seed")
+    for file, wanted in (("a.pth", ["nuscenes", 1, 0.8, 3, 0]), ("bare.pth", [None] * 5)):
+        out = tmp_path / f"run of {file}"
+        import_encoder(here, tmp_path / file, out)
+        export(here, out, "mmdet3d", tmp_path / "again.pth", recalibrate_scans=None)
+        for path in (out / "encoder.pth", tmp_path / "again.pth"):
+            facts = json.loads(sidecar(path).read_text())
+            assert [facts[name] for name in names] == wanted and facts["imported"]["file"] == str(tmp_path / file)
+
+
+@pytest.mark.parametrize(
+    "change,text",
+    [
+        (
+            lambda c: replace(
+                c, encoder=replace(c.encoder, pillars=replace(c.encoder.pillars, pillar_size=(0.4, 0.4)))
+            ),
+            r"voxel_size_m must be that of the encoder, \[0\.4, 0\.4, 6\.0\], got \[0\.8, 0\.8, 6\.0\]",
+        ),
+        (
+            lambda c: replace(c, point_range=(*c.point_range[:2], -4.0, *c.point_range[3:5], 2.0)),
+            r"point_range_m must be that of the encoder in z, \[-4\.0, 2\.0\], got \[-3\.0, 3\.0\]",
+        ),
+    ],
+)
+def test_weights_of_another_input_are_refused(
+    run: Path, tmp_path: Path, change: Callable[[PretrainConfig], PretrainConfig], text: str
+) -> None:
+    """Names and shapes would fit."""
+    config = tiny_config(run)
+    export(config, run, "openpcdet", tmp_path / "a.pth", recalibrate_scans=None)
+    other = change(config)
+    with pytest.raises(CheckpointError, match=text):
+        import_encoder(other, tmp_path / "a.pth", tmp_path / "out")
+    with pytest.raises(CheckpointError, match=text):
+        pretrain(replace(other, run=str(tmp_path / "new"), init_encoder=str(tmp_path / "a.pth")))
+    assert {path.name for path in tmp_path.iterdir()} == {"a.pth", "a.pth.json"}
+    weights = torch.load(tmp_path / "a.pth", weights_only=True)
+    weights["pred"]["point_channels"] = dict(reversed(weights["pred"]["point_channels"].items()))
+    torch.save(weights, tmp_path / "b.pth")
+    with pytest.raises(CheckpointError, match="point_channels must be that of the encoder, x_m, y_m, .* got age_s, "):
+        import_encoder(config, tmp_path / "b.pth", tmp_path / "out")
+
+
+def test_an_import_that_fails_leaves_nothing(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a run folder would pass for a run before its first checkpoint, and be trained from initial weights."""
+    config = tiny_config(run)
+    export(config, run, "openpcdet", tmp_path / "a.pth", recalibrate_scans=None)
+    before = {path.name for path in tmp_path.iterdir()}
+
+    def full(*arguments: Any, **named: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pred.export.save_checkpoint", full)
+        with pytest.raises(OSError, match="No space left"):
+            import_encoder(config, tmp_path / "a.pth", tmp_path / "out")
+    assert {path.name for path in tmp_path.iterdir()} == before
+    import_encoder(config, tmp_path / "a.pth", tmp_path / "out")
+    assert {path.name for path in tmp_path.iterdir()} == before | {"out"}
+
+
+@pytest.mark.parametrize(
+    "options,asked,text",
+    [
+        ({"foo": 1}, {}, "layout.options must be those of `pred export`, got foo = 1"),
+        ({"stride1_conv": "x"}, {}, "layout.options must be those of `pred export`, got stride1_conv = 'x'"),
+        ({"stride1_conv": 1}, {}, "layout.options must be those of `pred export`, got stride1_conv = 1"),
+        ([], {}, "layout.options must be a dictionary, got list"),
+        (
+            {"stride1_conv": True},
+            {"stride1_conv": False},
+            "--stride1-deblock must be left out or say what the file says",
+        ),
+        ({"prefix": "pts_"}, {"prefix": ""}, "--mmdet3d-prefix must be left out or say what the file says"),
+    ],
+)
+def test_what_a_file_says_of_itself(run: Path, tmp_path: Path, options: Any, asked: Any, text: str) -> None:
+    export(tiny_config(run), run, "mmdet3d", tmp_path / "a.pth", recalibrate_scans=None)
+    weights = torch.load(tmp_path / "a.pth", weights_only=True)
+    weights["pred"]["layout"]["options"] = options
+    torch.save(weights, tmp_path / "b.pth")
+    encoder = build_model(tiny_config(run)).encoder
+    with pytest.raises(CheckpointError, match=text):
+        load_encoder(encoder, tmp_path / "b.pth", LayoutOptions(**asked))
+
+
+def test_an_option_beside_what_the_file_says(run: Path, tmp_path: Path) -> None:
+    """Of what both say nothing is lost: the deblocks come back to the bit."""
+    options = LayoutOptions(dynamic_pillars=True)
+    export(tiny_config(run), run, "mmdet3d", tmp_path / "a.pth", recalibrate_scans=None, options=options)
+    encoder = build_model(tiny_config(run)).encoder
+    load_encoder(encoder, tmp_path / "a.pth", options)
+    assert all(torch.equal(encoder.state_dict()[name], value) for name, value in trained_encoder(run).items())
+    with pytest.raises(CheckpointError, match="--kernel-order must be dhwio, as the file says, got krsc"):
+        load_encoder(encoder, tmp_path / "a.pth", kernel_order="krsc")
+
+
+@pytest.mark.parametrize(
+    "state,text",
+    [
+        ({1: torch.zeros(2)}, "names of weights must be text, got 1"),
+        ({"vfe.a": torch.zeros(2, device="meta")}, "must be dense tensors with values, got a meta one as vfe.a"),
+        ({"vfe.a": torch.eye(2).to_sparse()}, "got a torch.sparse_coo one as vfe.a"),
+        ({}, "must hold weights, got none"),
+    ],
+)
+def test_weights_that_are_none(tmp_path: Path, state: Any, text: str) -> None:
+    torch.save({"model_state": state}, tmp_path / "a.pth")
+    with pytest.raises(CheckpointError, match=text):
+        read_weights(tmp_path / "a.pth")
 
 
 @pytest.mark.parametrize("to", FRAMEWORKS)
