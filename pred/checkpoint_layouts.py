@@ -501,7 +501,7 @@ def _options_of_file(
 ) -> LayoutOptions:
     prefix, dynamic, conv = options.prefix, options.dynamic_pillars, options.stride1_conv
     if prefix is None:
-        prefix = "pts_" if any(name.startswith("pts_") for name in state) else ""
+        prefix = "pts_" if any(re.match(r"(\w+\.)?pts_", name) for name in state) else ""
     dynamic = dynamic or any(re.search(r"voxel_encoder\.pfn_layers\.0\.0\.weight$", name) for name in state)
     if conv is None:
         said: set[bool] = set()
