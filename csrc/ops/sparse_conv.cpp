@@ -68,21 +68,28 @@ void product(const Problem& in, const Tensor& table, const S* source, bool trans
   });
 }
 
+// Goes along the table of fewer rows, as both hold the same pairs: of the inputs' one, it makes the transposed sums.
 template <typename S>
 void weight_gradient(const Problem& in, const S* grad, S* out) {
   using T = Compute<S>;
   const SparseConvKernels<S>& k = sparse_conv_kernels<S>();
-  const SparseConvArgs<S> a{in.out_to_in.const_data_ptr<int32_t>(),
-                            in.taps,
-                            in.inputs,
-                            in.outputs,
-                            storage<S>(in.features),
-                            nullptr,
-                            0,
-                            nullptr,
-                            grad};
-  const int64_t columns = k.columns(in.inputs), size = in.outputs * columns;
-  const Blocks blocks = product_sums(in.rows_out, in.taps * size * int64_t(sizeof(T)));
+  SparseConvArgs<S> a{in.out_to_in.const_data_ptr<int32_t>(),
+                      in.taps,
+                      in.inputs,
+                      in.outputs,
+                      storage<S>(in.features),
+                      nullptr,
+                      0,
+                      nullptr,
+                      grad};
+  const bool transposed = in.rows_in < in.rows_out;
+  if (transposed) {
+    a.table = in.in_to_out.const_data_ptr<int32_t>();
+    std::swap(a.inputs, a.outputs);
+    std::swap(a.source, a.grad);
+  }
+  const int64_t columns = k.columns(a.inputs), size = a.outputs * columns;
+  const Blocks blocks = product_sums(std::min(in.rows_in, in.rows_out), in.taps * size * int64_t(sizeof(T)));
   const int64_t count = blocks.count();
   const auto sums = allocate_array<T>(in.taps * count * size);
   parallel(in.taps * count, 1, [&](int64_t first, int64_t last) {
@@ -95,12 +102,13 @@ void weight_gradient(const Problem& in, const S* grad, S* out) {
     }
   });
   const auto total = allocate_array<T>(in.taps * size);
-  add_blocks(sums.get(), count, in.taps * size, in.taps * in.outputs, columns, columns, total.get());
+  add_blocks(sums.get(), count, in.taps * size, in.taps * a.outputs, columns, columns, total.get());
+  const int64_t output_stride = transposed ? 1 : columns, input_stride = transposed ? columns : 1;
   for (int64_t tap = 0; tap < in.taps; ++tap) {
     for (int64_t o = 0; o < in.outputs; ++o) {
-      const T* from = total.get() + tap * size + o * columns;
+      const T* from = total.get() + tap * size + o * output_stride;
       S* to = out + (o * in.taps + tap) * in.inputs;
-      for (int64_t c = 0; c < in.inputs; ++c) to[c] = narrow<S>(from[c]);
+      for (int64_t c = 0; c < in.inputs; ++c) to[c] = narrow<S>(from[c * input_stride]);
     }
   }
 }
