@@ -42,9 +42,11 @@ def published_slots(
     place = y % window[1] * window[0] + x % window[0] if along == 0 else x % window[0] * window[1] + y % window[1]
     sorted_pillars = torch.argsort(of_window * (window[0] * window[1]) + place)
     num_sets = -(-num_pillars // set_size)
-    window_of_set = torch.repeat_interleave(torch.arange(len(num_sets)), num_sets)
-    set_in_window = torch.arange(len(window_of_set)) - (num_sets.cumsum(0) - num_sets)[window_of_set]
-    slot = set_in_window[:, None] * set_size + torch.arange(set_size)
+    window_of_set = torch.repeat_interleave(torch.arange(len(num_sets), device=coords.device), num_sets)
+    set_in_window = (
+        torch.arange(len(window_of_set), device=coords.device) - (num_sets.cumsum(0) - num_sets)[window_of_set]
+    )
+    slot = set_in_window[:, None] * set_size + torch.arange(set_size, device=coords.device)
     taken = slot * num_pillars[window_of_set, None] // (num_sets[window_of_set, None] * set_size)
     return sorted_pillars[(num_pillars.cumsum(0) - num_pillars)[window_of_set, None] + taken]
 
@@ -73,8 +75,8 @@ class PlainDSVT(nn.Module):
                     for along in (0, 1)
                 ]
             )
-            in_window = (coords[:, [3, 2]] + torch.tensor(shift)) % torch.tensor(window)
-            positions.append(in_window.to(features.dtype) - torch.tensor(window, dtype=features.dtype) / 2)
+            in_window = (coords[:, [3, 2]] + coords.new_tensor(shift)) % coords.new_tensor(window)
+            positions.append(in_window.to(features.dtype) - features.new_tensor(window) / 2)
         for index, (block, norm) in enumerate(zip(self.stage_0, self.residual_norm_stage_0, strict=True)):
             before = features
             for number in (0, 1):
@@ -129,7 +131,7 @@ class _PlainAttention(nn.Module):
         value = features[slots]
         query = value + position[slots]
         attended = self.self_attn(query, query, value, repeats)[0].flatten(0, 1)
-        first = torch.empty(len(features), dtype=torch.int64)
+        first = torch.empty(len(features), dtype=torch.int64, device=features.device)
         first[slots[~repeats]] = (~repeats).flatten().nonzero()[:, 0]
         features = self.norm1(features + attended[first])
         return self.norm2(features + self.linear2(F.gelu(self.linear1(features))))

@@ -166,7 +166,8 @@ def _caveats(config: PretrainConfig, batch_norm: Mapping[str, Any], mask_ratio: 
     if encoder.kind != "voxels":
         points = encoder.pillars.max_points
         caveats.append(
-            "pillars are dynamic: every point counts; a hard pillar network takes the maximum over empty slots too"
+            "pillars are dynamic: every point inside the range counts, that in z too (OpenPCDet: MASK_Z: True); a hard "
+            "pillar network takes the maximum over empty slots too"
             if points is None
             else f"pillars are hard: the first {points} points count, and empty slots take part in the maximum"
         )

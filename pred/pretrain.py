@@ -160,6 +160,8 @@ class PretrainConfig:
             )
         if self.field.num_classes != NUM_CLASSES:
             raise ValueError(f"field.num_classes must be the labels' {NUM_CLASSES}, got {self.field.num_classes}")
+        if self.train.attention_in_proj == "freeze" and self.encoder.kind != "dsvt":
+            raise ValueError("train.attention_in_proj must be train for an encoder without attention, got freeze")
 
 
 class NonFiniteLossError(RuntimeError):
@@ -348,16 +350,11 @@ def build_model(config: PretrainConfig) -> Pretrainer:
 def build_optimizer(model: torch.nn.Module, train: TrainConfig) -> AdamW:
     """AdamW over all parameters, or over all but the frozen: ``attention_in_proj="freeze"`` takes the gradient from the
     parameters in `ATTENTION_IN_PROJ`, so they are neither moved nor decayed, nor part of the clipped norm.
-
-    Raises:
-        ValueError: there is nothing to freeze.
     """
     if train.attention_in_proj == "freeze":
-        frozen = [parameter for name, parameter in model.named_parameters() if name.split(".")[-1] in ATTENTION_IN_PROJ]
-        if not frozen:
-            raise ValueError("train.attention_in_proj must be train for a model without attention, got freeze")
-        for parameter in frozen:
-            parameter.requires_grad_(False)
+        for name, parameter in model.named_parameters():
+            if name.split(".")[-1] in ATTENTION_IN_PROJ:
+                parameter.requires_grad_(False)
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     betas = (train.momentum_range[1], train.beta2)
     return AdamW(parameters, lr=train.lr, betas=betas, weight_decay=train.weight_decay, fused=True)

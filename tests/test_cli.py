@@ -256,9 +256,10 @@ SIZES = {
 }  # fmt: skip
 
 
-def test_nuscenes_tiny_differs_from_nuscenes_pillars_in_sizes_only() -> None:
+def test_nuscenes_tiny_differs_from_nuscenes_pillars_in_sizes_and_frames_only() -> None:
     tiny, full = (flatten(plain(parse(f"--config={name}"))) for name in ("nuscenes_tiny", "nuscenes_pillars"))
-    assert {key for key in full if tiny[key] != full[key]} <= SIZES
+    assert {key for key in full if tiny[key] != full[key]} <= SIZES | {"data.split"}
+    assert full["data.split"] == "train" and tiny["data.split"] is None
 
 
 def test_nuscenes_pillars_has_the_papers_values() -> None:

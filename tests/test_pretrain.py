@@ -531,7 +531,8 @@ def test_attention_in_proj_is_trained_or_frozen(choice: Any) -> None:
 
 
 def test_a_run_with_frozen_projections_resumes_with_them(tmp_path: Path) -> None:
-    config = tiny_config(tmp_path / "run", steps=6, attention_in_proj="freeze")
+    config = tiny_config(tmp_path / "run", steps=6)
+    config.train.attention_in_proj = "freeze"
     config.encoder.kind = "dsvt"
     config.encoder.dsvt = DSVTConfig(d_model=8, num_heads=2, ffn_channels=8, num_blocks=2, set_size=6, window=(8, 8))
     initial = build_model(config).state_dict()
@@ -559,9 +560,8 @@ def test_frozen_parameters_of_the_published_models(config: DSVTConfig, frozen: i
 
 
 def test_nothing_to_freeze_is_refused(tmp_path: Path) -> None:
-    config = tiny_config(tmp_path / "run", attention_in_proj="freeze")
-    with pytest.raises(ValueError, match="train.attention_in_proj must be train for a model without attention"):
-        build_optimizer(build_model(config), config.train)
+    with pytest.raises(ValueError, match="train.attention_in_proj must be train for an encoder without attention"):
+        tiny_config(tmp_path / "run", attention_in_proj="freeze")
 
 
 def test_batch_norm_statistics_are_those_of_the_final_weights(finished: Path) -> None:

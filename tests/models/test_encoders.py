@@ -84,7 +84,7 @@ def parse(*arguments: str) -> PretrainConfig:
         ("pcdet_once_pp", ["--config=once_pillars"], 384),
         ("pcdet_once_cp", ["--config=once_voxels"], 512),
         ("pcdet_once_second", ["--config=once_second"], 512),
-        ("pcdet_once_pvrcnn", ["--config=once_second", "--config=once_large"], 512),
+        ("pcdet_once_pvrcnn", ["--config=once_second", "--data.split=raw_large", "--train.epochs=3"], 512),
         # The guess for ONCE has the sizes of Waymo's, whose points have five channels (the fifth is elongation).
         ("dsvt_waymo", ["--config=once_dsvt", "--data.dataset=nuscenes"], 384),
         ("pcdet_waymo_dsvt", ["--config=once_dsvt", "--data.dataset=nuscenes"], 384),
@@ -263,13 +263,13 @@ def test_point_order_does_not_matter_to_dynamic_features(family: str) -> None:
         (PillarConfig, {"vfe_filters": []}, "vfe_filters must name at least one layer"),
         (PillarConfig, {"vfe_filters": [7, 8]}, "vfe_filters must be even"),
         (PillarConfig, {"vfe_filters": [8, 0]}, r"vfe_filters must be at least 1 everywhere, got \[8, 0\]"),
-        (PillarConfig, {"pillar_size": (0.0, 1.0)}, "pillar_size must be positive"),
-        (PillarConfig, {"pillar_size": (math.nan, 1.0)}, "pillar_size must be positive"),
+        (PillarConfig, {"pillar_size": (0.0, 1.0)}, "pillar_size must be 2 positive lengths"),
+        (PillarConfig, {"pillar_size": (math.nan, 1.0)}, "pillar_size must be 2 positive lengths"),
         (PillarConfig, {"max_points": 0}, "max_points must be at least 1 or None, got 0"),
-        (PillarConfig, {"max_pillars": (5, 0)}, r"max_pillars must be at least 1, got \(5, 0\)"),
-        (VoxelConfig, {"voxel_size": (0.1, 0.1, -0.2)}, r"voxel_size must be positive, got \(0.1, 0.1, -0.2\)"),
+        (PillarConfig, {"max_pillars": (5, 0)}, r"max_pillars must be 2 numbers of at least 1, got \(5, 0\)"),
+        (VoxelConfig, {"voxel_size": (0.1, 0.1, -0.2)}, r"voxel_size must be 3 positive lengths, got \(0.1, 0.1, -0.2\)"),
         (VoxelConfig, {"max_points": -1}, "max_points must be at least 1 or None, got -1"),
-        (VoxelConfig, {"max_voxels": (0, 5)}, r"max_voxels must be at least 1, got \(0, 5\)"),
+        (VoxelConfig, {"max_voxels": (0, 5)}, r"max_voxels must be 2 numbers of at least 1, got \(0, 5\)"),
         (BEVBackboneConfig, {"num_filters": [8]}, "num_filters must have one entry per block"),
         (BEVBackboneConfig, {"layer_nums": []}, "layer_nums must name at least one block"),
         (BEVBackboneConfig, {"layer_nums": [3, 5, -1]}, r"layer_nums must be at least 0 everywhere"),
@@ -325,3 +325,48 @@ def test_blocks_must_have_more_than_one_cell(layer_strides: list[int], upsample_
     backbone = replace(BEV, layer_strides=layer_strides, upsample_strides=upsample_strides)
     with pytest.raises(ValueError, match="every block of a 32 x 20 grid more than one cell"):
         make(replace(FAMILIES["pillars"], backbone_2d=backbone))
+
+
+@pytest.mark.parametrize(
+    "make,text",
+    [
+        (lambda: BEVBackboneConfig(upsample_strides=[0.5, 1.4, 2]), "upsample_strides must be whole numbers or 1 over"),
+        (lambda: PillarConfig(pillar_size=(1.0,)), "pillar_size must be 2 positive lengths"),  # type: ignore[arg-type]
+        (lambda: PillarConfig(pillar_size=(math.inf, 1.0)), "pillar_size must be 2 positive lengths"),
+        (lambda: PillarConfig(max_pillars=(5,)), "max_pillars must be 2 numbers"),  # type: ignore[arg-type]
+        (lambda: VoxelConfig(voxel_size=(0.1, 0.1)), "voxel_size must be 3 positive lengths"),  # type: ignore[arg-type]
+        (lambda: VoxelConfig(max_voxels=(5,)), "max_voxels must be 2 numbers"),  # type: ignore[arg-type]
+        (lambda: VoxelConfig(backbone="plain", conv_bias=False), "conv_bias must be left out for the plain backbone"),
+        (
+            lambda: EncoderConfig("dsvt", pillars=PillarConfig(vfe_filters=[128], max_points=20)),
+            "pillars.max_points must be None for dsvt",
+        ),
+    ],
+)
+def test_sizes_that_do_not_go_together(make: Callable[[], object], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        make()
+
+
+def test_offsets_are_named_as_the_caller_names_them() -> None:
+    encoder = Encoder(
+        EncoderConfig(pillars=PillarConfig(vfe_filters=[8]), bev="before_2d"), (-3.2, -3.2, -1, 3.2, 3.2, 1)
+    )
+    points = torch.zeros(4, 5)
+    with pytest.raises(ValueError, match=r"Encoder: point_offsets must have shape \[B \+ 1\], got \[\]"):
+        encoder(points, torch.tensor(4))
+    with pytest.raises(ValueError, match="Encoder: point_offsets must ascend from 0 to N=4"):
+        encoder(points, torch.tensor([0, 5]))
+    with pytest.raises(TypeError, match="Encoder: point_offsets must be int64"):
+        encoder(points, torch.tensor([0, 4], dtype=torch.int32))
+
+
+def test_sync_batch_norm_is_refused_by_name() -> None:
+    config = DSVTConfig(d_model=8, num_heads=2, ffn_channels=8, num_blocks=2, set_size=4, window=(4, 4))
+    encoder = Encoder(
+        EncoderConfig("dsvt", bev="before_2d", pillars=PillarConfig(vfe_filters=[8]), dsvt=config),
+        (-3.2, -3.2, -1, 3.2, 3.2, 1),
+    )
+    converted = torch.nn.SyncBatchNorm.convert_sync_batchnorm(encoder).eval()
+    with pytest.raises(TypeError, match="DSVT: position_embedding_head.1 must be nn.BatchNorm1d, got SyncBatchNorm"):
+        converted(torch.rand(20, 5), torch.tensor([0, 20]))

@@ -59,6 +59,12 @@ class BEVBackboneConfig:
             raise ValueError(
                 f"BEVBackboneConfig: upsample_strides must be positive and finite, got {self.upsample_strides}"
             )
+        factors = [max(stride, 1 / stride) for stride in self.upsample_strides]
+        if any(abs(factor - round(factor)) > 1e-6 for factor in factors):
+            raise ValueError(
+                "BEVBackboneConfig: upsample_strides must be whole numbers or 1 over whole numbers, got "
+                f"{self.upsample_strides}"
+            )
 
 
 class _BEVBackbone(nn.Module):

@@ -170,7 +170,7 @@ class DSVT(nn.Module):
 
         Args:
             features: of each pillar.
-            coords: (b, z, y, x) of each pillar, no two alike: b below `num_frames`, y and x in the grid.
+            coords: (b, z, y, x) of each pillar, no two alike: b below `num_frames`, y and x in the grid (not checked).
             num_frames: B.
 
         Raises:
@@ -353,7 +353,12 @@ class PositionEmbedding(nn.Module):
         """Embedding of each pillar, from its cell in the window."""
         size_x, size_y = self.window
         first, norm, last = (self.position_embedding_head[index] for index in (0, 1, 3))
-        assert isinstance(first, nn.Linear) and isinstance(norm, nn.BatchNorm1d)
+        assert isinstance(first, nn.Linear)
+        if not isinstance(norm, nn.BatchNorm1d):
+            raise TypeError(
+                f"DSVT: position_embedding_head.1 must be nn.BatchNorm1d, got {type(norm).__name__}: cells are weighed "
+                "by their pillars here, which SyncBatchNorm does not do"
+            )
         with torch.autocast(cell.device.type, enabled=False):
             cells = torch.arange(size_x * size_y, device=cell.device)
             position = torch.stack([cells % size_x - size_x / 2, cells // size_x - size_y / 2], dim=1)

@@ -28,6 +28,7 @@ from pred.models.encoders.voxels import (
     VoxelConfig,
     VoxelResBackBone8x,
 )
+from pred.ops._check import check_offsets
 
 
 @dataclass
@@ -35,7 +36,8 @@ class EncoderConfig:
     """Family and sizes of the encoder; the defaults are CenterPoint's with dynamic pillars on nuScenes."""
 
     kind: Literal["pillars", "voxels", "dsvt"] = "pillars"
-    """pillars: `pillars` alone; voxels: `voxels`; dsvt: `pillars`, then `dsvt`. Parts of other kinds are not used."""
+    """pillars: `pillars` alone; voxels: `voxels`; dsvt: `pillars`, then `dsvt`. Parts of other kinds are not used;
+    `backbone_2d` has to be chosen with the kind."""
     bev: Literal["after_2d", "before_2d"] = "after_2d"
     """Where the field reads the map: after the 2D backbone, or before it; then there is no `backbone_2d`."""
     pillars: PillarConfig = field(default_factory=PillarConfig)
@@ -48,6 +50,11 @@ class EncoderConfig:
     """2D backbone."""
 
     def __post_init__(self) -> None:
+        if self.kind == "dsvt" and self.pillars.max_points is not None:
+            raise ValueError(
+                f"EncoderConfig: pillars.max_points must be None for dsvt, whose pillars are dynamic, got "
+                f"{self.pillars.max_points}"
+            )
         if self.kind == "dsvt" and self.pillars.vfe_filters[-1] != self.dsvt.d_model:
             raise ValueError(
                 f"EncoderConfig: pillars.vfe_filters must end with dsvt.d_model = {self.dsvt.d_model}, got "
@@ -139,14 +146,20 @@ class Encoder(nn.Module):
         map. Voxelization and point features keep the parameters' precision even under autocast (bf16 cannot hold
         coordinates); the 3D and the 2D backbone obey it.
 
+        Args:
+            points: coordinates may be NaN or infinite (such points are ignored), other channels are finite.
+            point_offsets: ascending from 0 to N.
+
         Raises:
-            ValueError: points have fewer than D channels.
+            ValueError: points have fewer than D channels; shape or values of the offsets.
+            TypeError: the offsets are not int64.
         """
         if points.dim() != 2 or points.shape[1] < self.point_channels:
             raise ValueError(
                 f"Encoder: points must have shape [N, D] with D of at least {self.point_channels}, got "
                 f"{list(points.shape)}"
             )
+        check_offsets("Encoder", "point_offsets", point_offsets, "BN", "points", points)
         num_frames = point_offsets.shape[0] - 1
         with torch.autocast(points.device.type, enabled=False):
             features, coords = self.vfe(points[:, : self.point_channels], point_offsets)

@@ -11,6 +11,7 @@ N points, M pillars, P slots per pillar, B frames, D raw point channels, C featu
 
 # No `from __future__ import annotations`: jsonargparse reads the field types of the configuration.
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -35,8 +36,8 @@ class PillarConfig:
     """Pillars of a frame that count in training and in evaluation, the first ones; only with `max_points`."""
 
     def __post_init__(self) -> None:
-        if not all(size > 0 for size in self.pillar_size):
-            raise ValueError(f"PillarConfig: pillar_size must be positive, got {tuple(self.pillar_size)}")
+        if len(self.pillar_size) != 2 or not all(0 < size < math.inf for size in self.pillar_size):
+            raise ValueError(f"PillarConfig: pillar_size must be 2 positive lengths, got {tuple(self.pillar_size)}")
         if not self.vfe_filters:
             raise ValueError("PillarConfig: vfe_filters must name at least one layer, got []")
         if min(self.vfe_filters) < 1:
@@ -47,8 +48,10 @@ class PillarConfig:
             )
         if self.max_points is not None and self.max_points < 1:
             raise ValueError(f"PillarConfig: max_points must be at least 1 or None, got {self.max_points}")
-        if min(self.max_pillars) < 1:
-            raise ValueError(f"PillarConfig: max_pillars must be at least 1, got {tuple(self.max_pillars)}")
+        if len(self.max_pillars) != 2 or min(self.max_pillars) < 1:
+            raise ValueError(
+                f"PillarConfig: max_pillars must be 2 numbers of at least 1, got {tuple(self.max_pillars)}"
+            )
 
 
 class DynamicPillarVFE(nn.Module):

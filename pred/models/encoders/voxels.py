@@ -9,6 +9,7 @@ N points, M voxels, B frames, D raw point channels, C feature channels.
 
 # No `from __future__ import annotations`: jsonargparse reads the field types of the configuration.
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -40,12 +41,16 @@ class VoxelConfig:
     """Voxels of a frame that count in training and in evaluation, the first ones; only with `max_points`."""
 
     def __post_init__(self) -> None:
-        if not all(size > 0 for size in self.voxel_size):
-            raise ValueError(f"VoxelConfig: voxel_size must be positive, got {tuple(self.voxel_size)}")
+        if len(self.voxel_size) != 3 or not all(0 < size < math.inf for size in self.voxel_size):
+            raise ValueError(f"VoxelConfig: voxel_size must be 3 positive lengths, got {tuple(self.voxel_size)}")
         if self.max_points is not None and self.max_points < 1:
             raise ValueError(f"VoxelConfig: max_points must be at least 1 or None, got {self.max_points}")
-        if min(self.max_voxels) < 1:
-            raise ValueError(f"VoxelConfig: max_voxels must be at least 1, got {tuple(self.max_voxels)}")
+        if len(self.max_voxels) != 2 or min(self.max_voxels) < 1:
+            raise ValueError(f"VoxelConfig: max_voxels must be 2 numbers of at least 1, got {tuple(self.max_voxels)}")
+        if self.backbone == "plain" and not self.conv_bias:
+            raise ValueError(
+                "VoxelConfig: conv_bias must be left out for the plain backbone, which has none, got False"
+            )
 
 
 class DynamicMeanVFE(nn.Module):
