@@ -267,7 +267,7 @@ def test_point_order_does_not_matter_to_dynamic_features(family: str) -> None:
         (PillarConfig, {"pillar_size": (math.nan, 1.0)}, "pillar_size must be 2 positive lengths"),
         (PillarConfig, {"max_points": 0}, "max_points must be at least 1 or None, got 0"),
         (PillarConfig, {"max_pillars": (5, 0)}, r"max_pillars must be 2 numbers of at least 1, got \(5, 0\)"),
-        (VoxelConfig, {"voxel_size": (0.1, 0.1, -0.2)}, r"voxel_size must be 3 positive lengths, got \(0.1, 0.1, -0.2\)"),
+        (VoxelConfig, {"voxel_size": (0.1, 0.1, -0.2)}, r"voxel_size must be 3 positive lengths, got .*-0.2"),
         (VoxelConfig, {"max_points": -1}, "max_points must be at least 1 or None, got -1"),
         (VoxelConfig, {"max_voxels": (0, 5)}, r"max_voxels must be 2 numbers of at least 1, got \(0, 5\)"),
         (BEVBackboneConfig, {"num_filters": [8]}, "num_filters must have one entry per block"),
