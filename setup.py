@@ -6,7 +6,8 @@ Environment:
     PRED_TORCH_DIR=DIR       folder of the torch package whose headers are used (default: the one found)
     PRED_REQUIRE_NATIVE=1    make a missing torch or compiler an error instead of a pure-Python install
     PRED_NATIVE=0            leave the native build out on purpose
-    PRED_CUDA=auto|0|1       CUDA library (there is none yet: 1 is an error)
+    PRED_CUDA=auto|0|1       CUDA library; auto: where torch has CUDA and an nvcc of the same major version is there
+    PRED_CUDA=emulate        its kernels run on the CPU, for tests
     PRED_SANITIZE=LIST       sanitizers, such as address,undefined
     DEBUG=1                  symbols, warnings as errors
     MAX_JOBS=N               parallel compile jobs
@@ -89,6 +90,32 @@ def pybind11_options() -> list[str]:
     return [f"-Dpybind11_DIR={pybind11.get_cmake_dir()}", f"-DPython_EXECUTABLE={sys.executable}"]
 
 
+def choose_cuda(torch_dir: Path) -> tuple[str, str | None]:
+    """CMake's PRED_CUDA, and why there is no CUDA library, or None."""
+    wanted = os.environ.get("PRED_CUDA") or "auto"
+    if wanted not in ("auto", "0", "1", "emulate"):
+        raise SystemExit(f"PRED_CUDA must be auto, 0, 1 or emulate, got {wanted}")
+    if wanted == "0":
+        return "OFF", "left out on request (PRED_CUDA=0)"
+    if wanted == "emulate":
+        return "EMULATE", "emulated on the CPU (PRED_CUDA=emulate)"
+    version = re.search(r"^cuda\b.*= '(\d+)", (torch_dir / "version.py").read_text(), re.MULTILINE)
+    nvcc = os.environ.get("CUDACXX") or shutil.which("nvcc")
+    if wanted == "1":
+        if not nvcc:
+            raise SystemExit("PRED_CUDA=1, but nvcc was not found on PATH")
+        return "ON", None
+    if not version:
+        return "OFF", "torch was built without CUDA"
+    if not nvcc:
+        return "OFF", "nvcc was not found on PATH"
+    report = subprocess.run([nvcc, "--version"], capture_output=True, text=True).stdout
+    release = re.search(r"release (\d+)", report)
+    if not release or release[1] != version[1]:
+        return "OFF", f"torch has CUDA {version[1]}, nvcc is of CUDA {release[1] if release else '(unknown)'}"
+    return "ON", None
+
+
 class CMakeBuild(build_ext):
     """Builds the native libraries into the package folder and writes pred/build_info.json there."""
 
@@ -108,14 +135,14 @@ class CMakeBuild(build_ext):
         (package / "build_info.json").write_text(json.dumps(record, indent=1) + "\n")
 
     def build_native(self, package: Path) -> dict[str, object]:
-        if os.environ.get("PRED_CUDA", "auto") == "1":
-            raise SystemExit("PRED_CUDA=1: this version has no CUDA library yet; CUDA tensors use the references")
         torch_dir, torch_version = find_torch()
+        cuda, no_cuda = choose_cuda(torch_dir)
         cmake, ninja = find_tool("cmake"), find_tool("ninja")
         compiler = compiler_options()
         debug = os.environ.get("DEBUG") == "1"
         sanitize = os.environ.get("PRED_SANITIZE", "")
-        build = Path(self.build_temp).resolve() / ("sanitize" if sanitize else "debug" if debug else "release")
+        kind = ("sanitize" if sanitize else "debug" if debug else "release") + ("-emulate" if cuda == "EMULATE" else "")
+        build = Path(self.build_temp).resolve() / kind
         build.mkdir(parents=True, exist_ok=True)
         # The compiler and ninja are named each time: pip's isolated copies of an earlier build are gone.
         if (build / "CMakeCache.txt").exists():
@@ -128,14 +155,17 @@ class CMakeBuild(build_ext):
             f"-DCMAKE_INSTALL_PREFIX={package}",
             f"-DPRED_TORCH_DIR={torch_dir}",
             f"-DPRED_SANITIZE={sanitize}",
+            f"-DPRED_CUDA={cuda}",
             f"-DPRED_WERROR={'ON' if debug else 'OFF'}",
             *pybind11_options(),
         ]  # fmt: skip
         jobs = os.environ.get("MAX_JOBS")
         subprocess.run(configure, check=True)
         subprocess.run([cmake, "--build", str(build), *(["-j", jobs] if jobs else [])], check=True)
+        for stale in package.glob("libpred_*"):  # of an earlier build, with other options
+            stale.unlink()
         subprocess.run([cmake, "--install", str(build)], check=True)
-        return {"native": True, "reason": None, "torch": torch_version}
+        return {"native": True, "reason": None, "torch": torch_version, "cuda": no_cuda is None, "no_cuda": no_cuda}
 
     def get_outputs(self) -> list[str]:
         package = Path(self.build_lib) / "pred"

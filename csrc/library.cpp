@@ -145,7 +145,7 @@ std::string build_info() {
 }
 
 void parallel_probe(const Tensor& out, int64_t grain, int64_t fail_at) {
-  check_cpu_tensor("parallel_probe", "out", out, 1, ScalarType::Long);
+  check_tensor("parallel_probe", "out", out, 1, ScalarType::Long);
   PRED_CHECK(out.is_contiguous(), "parallel_probe: out must be contiguous");
   static std::atomic<int64_t> next_id{0};
   int64_t* data = out.mutable_data_ptr<int64_t>();

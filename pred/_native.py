@@ -21,6 +21,9 @@ from torch import Tensor
 
 _FOLDER = Path(__file__).resolve().parent
 _LIBRARY = _FOLDER / ("libpred_cpu.dylib" if sys.platform == "darwin" else "libpred_cpu.so")
+_CUDA_LIBRARY = _FOLDER / "libpred_cuda.so"
+_EMULATED = _FOLDER / "libpred_emulated.so"
+"""CUDA kernels that run on CPU tensors, in place of the CPU's own (PRED_CUDA=emulate): for tests."""
 _INSTALL_HINT = "install torch first, then run: pip install --no-build-isolation ."
 
 
@@ -34,18 +37,33 @@ def _build_record() -> dict[str, Any]:
         return {"native": False, "reason": f"build_info.json is unreadable: {error}"}
 
 
-def _load() -> str | None:
-    """Loads the library once; returns why it is missing, or None."""
-    if not _LIBRARY.exists():
-        return str(_build_record().get("reason") or f"{_LIBRARY.name} is not in {_FOLDER}")
+def _load(library: Path) -> str | None:
+    """Loads a library once; returns why it does not load, or None."""
     try:
-        torch.ops.load_library(str(_LIBRARY))
+        torch.ops.load_library(str(library))
     except (OSError, RuntimeError) as error:
-        return f"{_LIBRARY.name} does not load: {error.__cause__ or error}"  # the cause is the linker's own text
+        return f"{library.name} does not load: {error.__cause__ or error}"  # the cause is the linker's own text
     return None
 
 
-_MISSING: str | None = _load()
+def _load_cpu() -> str | None:
+    if not _LIBRARY.exists():
+        return str(_build_record().get("reason") or f"{_LIBRARY.name} is not in {_FOLDER}")
+    return _load(_LIBRARY) or (_load(_EMULATED) if _EMULATED.exists() else None)
+
+
+def _load_cuda() -> str | None:
+    if _MISSING is not None:
+        return _MISSING
+    if not _CUDA_LIBRARY.exists():
+        return str(_build_record().get("no_cuda") or f"{_CUDA_LIBRARY.name} is not in {_FOLDER}")
+    if torch.version.cuda is None:
+        return "this torch is built without CUDA"
+    return _load(_CUDA_LIBRARY)
+
+
+_MISSING: str | None = _load_cpu()
+_MISSING_CUDA: str | None = _load_cuda()
 _warned_cuda: set[str] = set()
 
 if _MISSING is not None and os.environ.get("PRED_BACKEND", "auto") == "auto":
@@ -67,7 +85,8 @@ def native_status() -> dict[str, Any]:
 
     Returns:
         ``available``, ``reason`` (why not, else None), ``path``, ``build`` (record of the build and, when loaded,
-        compiler, build type, sanitizers and levels), ``cpu_capability`` (level in force, or None).
+        compiler, build type, sanitizers and levels), ``cpu_capability`` (level in force, or None), ``cuda`` (whether
+        there are CUDA kernels), ``cuda_reason`` (why not, else None), ``emulated`` (see :data:`_EMULATED`).
     """
     build = _build_record()
     level = None
@@ -82,6 +101,9 @@ def native_status() -> dict[str, Any]:
         "path": str(_LIBRARY),
         "build": build,
         "cpu_capability": level,
+        "cuda": _MISSING_CUDA is None,
+        "cuda_reason": _MISSING_CUDA,
+        "emulated": _EMULATED.exists(),
     }
 
 
@@ -96,12 +118,16 @@ def _backend() -> str:
 
 
 @torch.compiler.assume_constant_result
-def _no_kernel(op: str, device: str, required: bool) -> bool:
+def _has_kernel(op: str, device: str, required: bool) -> bool:
+    key = {"cuda": "CUDA"}.get(device)
+    if key is not None and torch._C._dispatch_has_kernel_for_dispatch_key(f"pred::{op}", key):
+        return True
+    why = f" ({_MISSING_CUDA})" if device == "cuda" and _MISSING_CUDA is not None else ""
     if required:
-        raise RuntimeError(f"{op}: PRED_BACKEND=native, but there is no kernel for device {device!r}")
+        raise RuntimeError(f"{op}: PRED_BACKEND=native, but there is no kernel for device {device!r}{why}")
     if op not in _warned_cuda:
         _warned_cuda.add(op)
-        warnings.warn(f"{op}: no {device} kernel yet; the PyTorch reference is used", RuntimeWarning, stacklevel=3)
+        warnings.warn(f"{op}: no {device} kernel{why}; the PyTorch reference is used", RuntimeWarning, stacklevel=3)
     return False
 
 
@@ -135,7 +161,7 @@ def use_native(op: str, tensor: Tensor) -> bool:
         return False
     if tensor.device.type == "cpu":
         return True
-    return _no_kernel(op, tensor.device.type, backend == "native")
+    return _has_kernel(op, tensor.device.type, backend == "native")
 
 
 def checked(op: Callable[..., Any], *arguments: Any) -> Any:

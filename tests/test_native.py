@@ -105,7 +105,7 @@ def test_other_devices_take_the_reference_with_one_warning(monkeypatch: pytest.M
     monkeypatch.setattr(_native, "_MISSING", None)
     monkeypatch.setattr(_native, "_warned_cuda", set())
     bev, grid = torch.zeros(1, 1, 1, 1, device="meta"), torch.zeros(1, 1, 2, device="meta")
-    with pytest.warns(RuntimeWarning, match="sample_bev: no meta kernel yet; the PyTorch reference is used"):
+    with pytest.warns(RuntimeWarning, match="sample_bev: no meta kernel; the PyTorch reference is used"):
         assert not _native.use_native("sample_bev", bev)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

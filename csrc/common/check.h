@@ -14,6 +14,7 @@
 #include <string>
 #include <vector>
 
+#include "common/device.h"
 #include "math/half.h"
 
 namespace pred {
@@ -46,8 +47,8 @@ inline std::string shape_text(const Tensor& tensor) { return shape_text(sizes(te
     if (!(condition)) throw std::invalid_argument(::pred::concat(__VA_ARGS__)); \
   } while (0)
 
-inline void check_cpu_tensor(const char* op, const char* name, const Tensor& tensor, int64_t dim, ScalarType dtype) {
-  PRED_CHECK(tensor.is_cpu(), op, ": ", name, " must be a CPU tensor, got one on another device");
+inline void check_tensor(const char* op, const char* name, const Tensor& tensor, int64_t dim, ScalarType dtype) {
+  PRED_CHECK(on_right_device(tensor), op, ": ", name, " must be ", kRightDevice, ", got one on another device");
   PRED_CHECK(tensor.dim() == dim, op, ": ", name, " must have ", dim, " dimensions, got shape ", shape_text(tensor));
   PRED_CHECK(tensor.scalar_type() == dtype, op, ": ", name, " must have dtype ", torch::headeronly::toString(dtype),
              ", got ", torch::headeronly::toString(tensor.scalar_type()));
@@ -60,11 +61,13 @@ inline void check_sizes(const char* op, const char* name, const Tensor& tensor, 
 
 // The sharpness of a sigmoid.
 template <typename T>
-T read_sharpness(const char* op, const Tensor& inv_s, ScalarType dtype) {
-  check_cpu_tensor(op, "inv_s", inv_s, 0, dtype);
-  const T value = *inv_s.const_data_ptr<T>();
-  PRED_CHECK(value >= 0 && value <= std::numeric_limits<T>::max(), op, ": inv_s must be finite and not negative, got ",
-             value);
+const T* sharpness(const char* op, const Tensor& inv_s, ScalarType dtype) {
+  check_tensor(op, "inv_s", inv_s, 0, dtype);
+  const T* value = inv_s.const_data_ptr<T>();
+  if constexpr (!kLaunch) {
+    PRED_CHECK(*value >= 0 && *value <= std::numeric_limits<T>::max(), op,
+               ": inv_s must be finite and not negative, got ", *value);
+  }
   return value;
 }
 

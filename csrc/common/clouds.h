@@ -14,8 +14,12 @@ namespace pred {
 
 // Checked and contiguous; `letter` names the number of rows in the message.
 inline Tensor read_offsets(const char* op, const char* name, const Tensor& offsets_in, char letter, int64_t num_rows) {
-  check_cpu_tensor(op, name, offsets_in, 1, ScalarType::Long);
+  check_tensor(op, name, offsets_in, 1, ScalarType::Long);
   const Tensor offsets = torch::stable::contiguous(offsets_in);
+  if (kLaunch) {
+    PRED_CHECK(offsets.size(0) >= 1, op, ": ", name, " must have at least one entry");
+    return offsets;
+  }
   const int64_t* offset = offsets.const_data_ptr<int64_t>();
   const int64_t num_frames = offsets.size(0) - 1;
   PRED_CHECK(num_frames >= 0 && offset[0] == 0 && std::is_sorted(offset, offset + num_frames + 1) &&

@@ -35,7 +35,14 @@ const Table& pick(Isa isa, const Table& baseline, const Table& avx2, const Table
 
 }  // namespace pred
 
-#if !defined(PRED_NUM_LEVELS) || PRED_NUM_LEVELS == 4
+#ifdef PRED_LAUNCH
+// Kernels that are launched (common/device.h) have one table.
+#define PRED_DECLARE_KERNELS(Table, name) \
+  namespace pred::device {                \
+  extern const Table name;                \
+  }
+#define PRED_KERNELS(name) (::pred::device::name)
+#elif !defined(PRED_NUM_LEVELS) || PRED_NUM_LEVELS == 4
 #define PRED_DECLARE_KERNELS(Table, name) \
   namespace pred::isa_default {           \
   extern const Table name;                \

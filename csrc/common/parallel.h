@@ -2,14 +2,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // CPU driver: an index loop on torch's own thread pool, so that torch.set_num_threads is obeyed and no
-// second OpenMP runtime enters the process.
+// second OpenMP runtime enters the process. In a binding that launches kernels (common/device.h), body is called once.
 #pragma once
 
 #include <torch/csrc/stable/ops.h>
 
 #include <atomic>
 #include <exception>
-#include <vector>
+
+#include "common/device.h"
 
 namespace pred {
 
@@ -18,6 +19,7 @@ namespace pred {
 template <class Body>
 void parallel(int64_t count, int64_t grain, const Body& body) {
   if (count <= 0) return;
+  if (kLaunch) return body(int64_t(0), count);
   std::exception_ptr error;
   std::atomic<bool> failed{false};
   torch::stable::parallel_for(0, count, grain < 1 ? 1 : grain, [&](int64_t begin, int64_t end) {
@@ -28,13 +30,6 @@ void parallel(int64_t count, int64_t grain, const Body& body) {
     }
   });
   if (error) std::rethrow_exception(error);
-}
-
-// One thread, in order: the same bits for any number of threads.
-inline double ordered_sum(const std::vector<double>& parts) {
-  double sum = 0;
-  for (const double part : parts) sum += part;
-  return sum;
 }
 
 }  // namespace pred

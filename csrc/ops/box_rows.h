@@ -32,7 +32,7 @@ class BoxColumns {
 };
 
 inline Tensor read_box_rows(const char* op, const char* name, const Tensor& boxes, ScalarType dtype) {
-  check_cpu_tensor(op, name, boxes, 2, dtype);
+  check_tensor(op, name, boxes, 2, dtype);
   PRED_CHECK(boxes.size(1) == 7, op, ": ", name, " must have shape [N, 7], got ", shape_text(boxes));
   return torch::stable::contiguous(boxes);
 }

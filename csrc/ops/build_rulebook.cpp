@@ -148,7 +148,7 @@ std::tuple<Tensor, Tensor, Tensor> build_rulebook(const Tensor& indices_in, int6
                                                   std::vector<int64_t> stride, std::vector<int64_t> padding,
                                                   std::vector<int64_t> dilation, bool submanifold) {
   const char* op = "build_rulebook";
-  check_cpu_tensor(op, "indices", indices_in, 2, ScalarType::Long);
+  check_tensor(op, "indices", indices_in, 2, ScalarType::Long);
   PRED_CHECK(indices_in.size(1) == 4, op, ": indices must have shape [M, 4], got ", shape_text(indices_in));
   const Tensor indices = torch::stable::contiguous(indices_in);
   const RulebookArgs a =

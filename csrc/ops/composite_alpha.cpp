@@ -39,7 +39,7 @@ std::tuple<Tensor, Tensor, Tensor> composite_alpha_backward(
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) {
-  m.impl("composite_alpha", TORCH_BOX(&pred::composite_alpha));
-  m.impl("composite_alpha_backward", TORCH_BOX(&pred::composite_alpha_backward));
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) {
+  PRED_IMPL(m, "composite_alpha", &pred::composite_alpha);
+  PRED_IMPL(m, "composite_alpha_backward", &pred::composite_alpha_backward);
 }

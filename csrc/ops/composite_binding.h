@@ -15,6 +15,7 @@
 #include "common/check.h"
 #include "common/clouds.h"
 #include "common/parallel.h"
+#include "common/parts.h"
 #include "ops/composite.h"
 
 namespace pred {
@@ -80,23 +81,23 @@ struct CompositeInputs {
   CompositeInputs(const char* name, const char* source_name, const Tensor& source, const std::optional<Tensor>& t,
                   const std::optional<Tensor>& values, const std::optional<Tensor>& offsets, bool depth_mid)
       : op(name), has_t(t), has_values(values) {
-    check_cpu_tensor(op, source_name, source, offsets ? 1 : 2, dtype);
+    check_tensor(op, source_name, source, offsets ? 1 : 2, dtype);
     if (offsets) {
       const Tensor checked = read_offsets(op, "ray_offsets", *offsets, 'P', source.size(0));
       num_rays = checked.size(0) - 1;
       samples = {source.size(0)};
-      args.rows = {keep<int64_t>(checked), 0};
+      args.rows = {keep<int64_t>(checked), 0, source.size(0)};
     } else {
       num_rays = source.size(0);
       samples = {num_rays, source.size(1)};
-      args.rows = {nullptr, source.size(1)};
+      args.rows = {nullptr, source.size(1), 0};
     }
     PRED_CHECK(num_rays < int64_t(1) << 40, op, ": ", source_name, " must have fewer than 2^40 rays, got ", num_rays);
     args.source = keep<T>(source);
     args.t = pointer<T>("t", t, samples);
     args.depth_mid = depth_mid;
     if (!values) return;
-    check_cpu_tensor(op, "values", *values, int64_t(samples.size()) + 1, values_dtype);
+    check_tensor(op, "values", *values, int64_t(samples.size()) + 1, values_dtype);
     args.channels = values->size(values->dim() - 1);
     check_channels("values");
     args.values = pointer<S>("values", values, with(samples, args.channels));
@@ -119,7 +120,7 @@ struct CompositeInputs {
   template <typename Element>
   const Element* pointer(const char* name, const std::optional<Tensor>& tensor, const std::vector<int64_t>& shape) {
     if (!tensor) return nullptr;
-    check_cpu_tensor(op, name, *tensor, int64_t(shape.size()), scalar_type(Element()));
+    check_tensor(op, name, *tensor, int64_t(shape.size()), scalar_type(Element()));
     check_sizes(op, name, *tensor, shape);
     return keep<Element>(*tensor);
   }
@@ -134,6 +135,7 @@ struct CompositeInputs {
   // body(longest, scratch, begin, end), the rest of a kernel's arguments.
   template <class Body>
   void for_rays(const CompositeKernels<Args>& kernels, const Body& body) const {
+    if (kLaunch) return body(static_cast<T*>(nullptr), int64_t(0), int64_t(0), num_rays);
     RayTasks(args.rows, num_rays, args.channels).run([&](int64_t longest, int64_t begin, int64_t end) {
       std::vector<T> scratch(kernels.scratch_size(args, longest));
       body(scratch.data(), longest, begin, end);
@@ -185,7 +187,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_backward(
   using S = typename Args::Storage;
   using T = Compute<S>;
   if (grads.values && !in.has_values) {  // values are needed for the gradient of the source only
-    check_cpu_tensor(in.op, "grad_values", *grads.values, 2, in.values_dtype);
+    check_tensor(in.op, "grad_values", *grads.values, 2, in.values_dtype);
     in.args.channels = grads.values->size(1);
     in.check_channels("grad_values");
   }
@@ -202,16 +204,16 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_backward(
   Tensor out_inv_s = output_tensor(like, need.inv_s, {}, in.dtype);
   Tensor out_t = output_tensor(like, need.t, in.samples, in.dtype);
   Tensor out_values = output_tensor(like, need.values, in.values_shape(), in.values_dtype);
-  std::vector<double> per_ray(need.inv_s ? in.num_rays : 0);
+  const Tensor per_ray = output_tensor(like, need.inv_s, {in.num_rays}, ScalarType::Double);
   int64_t bytes = in.args.channels * int64_t(sizeof(S));
   for (const int64_t size : in.samples) bytes *= size;
   const CompositeGradients<S> out{need.source ? mutable_storage<T>(out_source) : nullptr,
-                                  need.inv_s ? per_ray.data() : nullptr, need.t ? mutable_storage<T>(out_t) : nullptr,
+                                  need.inv_s ? mutable_storage<double>(per_ray) : nullptr, need.t ? mutable_storage<T>(out_t) : nullptr,
                                   need.values ? mutable_storage<S>(out_values) : nullptr, bytes >= kStreamBytes};
   in.for_rays(kernels, [&](T* scratch, int64_t longest, int64_t begin, int64_t end) {
     kernels.backward(in.args, saved, grad, out, scratch, longest, begin, end);
   });
-  if (need.inv_s) *mutable_storage<T>(out_inv_s) = T(ordered_sum(per_ray));
+  if (need.inv_s) add_parts(storage<double>(per_ray), in.num_rays, mutable_storage<T>(out_inv_s));
   return {out_source, out_inv_s, out_t, out_values};
 }
 

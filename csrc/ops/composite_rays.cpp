@@ -16,7 +16,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> composite_rays(const Tensor& 
   const char* op = "composite_rays";
   return PRED_DISPATCH_STORAGE(op, storage_type(sdf, values), [&] {
     CompositeInputs<CompositeRaysArgs<S>> in(op, "sdf", sdf, t, values, ray_offsets, depth_mid);
-    in.args.inv_s = read_sharpness<T>(op, inv_s, in.dtype);
+    in.args.inv_s = sharpness<T>(op, inv_s, in.dtype);
     in.args.last_opaque = last_opaque;
     Tensor remaining = output_tensor(sdf, true, {in.num_rays}, in.dtype);
     auto out = composite(in, composite_rays_kernels<S>(), sdf, mutable_storage<T>(remaining));
@@ -32,7 +32,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_rays_backward(
   const char* op = "composite_rays_backward";
   return PRED_DISPATCH_STORAGE(op, storage_type(sdf, values, grad_values), [&] {
     CompositeInputs<CompositeRaysArgs<S>> in(op, "sdf", sdf, t, values, ray_offsets, depth_mid);
-    in.args.inv_s = read_sharpness<T>(op, inv_s, in.dtype);
+    in.args.inv_s = sharpness<T>(op, inv_s, in.dtype);
     in.args.last_opaque = last_opaque;
     const CompositeSaved<T> saved{in.template pointer<T>("weights", weights, in.samples),
                                   in.template pointer<T>("remaining", remaining, {in.num_rays})};
@@ -45,7 +45,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_rays_backward(
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) {
-  m.impl("composite_rays", TORCH_BOX(&pred::composite_rays));
-  m.impl("composite_rays_backward", TORCH_BOX(&pred::composite_rays_backward));
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) {
+  PRED_IMPL(m, "composite_rays", &pred::composite_rays);
+  PRED_IMPL(m, "composite_rays_backward", &pred::composite_rays_backward);
 }

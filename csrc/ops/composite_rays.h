@@ -19,9 +19,17 @@ namespace pred {
 
 template <typename S>
 struct CompositeRaysArgs : CompositeArgs<S> {
-  Compute<S> inv_s;
+  const Compute<S>* inv_s;
   bool last_opaque;
 };
+
+// dL/d(s d_i), from Phi(-s d_i), T_i, A_{i-1}, A_i, H_{i-1} and H_i; falls: the distance does from i - 1 to i, to i + 1.
+template <typename V, typename M>
+PRED_HOST_DEVICE V slope_of_distance(V occupied, M falls_before, M falls_after, V light, V cotangent_before,
+                                     V cotangent, V h_before, V h) {
+  const V both = light * (cotangent - cotangent_before), one = h - h_before;
+  return occupied * ((falls_before & falls_after) ? both : one);
+}
 
 template <typename S>
 using CompositeRaysKernels = CompositeKernels<CompositeRaysArgs<S>>;

@@ -17,7 +17,7 @@ struct DistanceField {
   const CompositeRaysArgs<S>& a;
   const ExpScale<T> s;
 
-  explicit DistanceField(const CompositeRaysArgs<S>& args) : a(args), s(exp_scale(args.inv_s)) {}
+  explicit DistanceField(const CompositeRaysArgs<S>& args) : a(args), s(exp_scale(*args.inv_s)) {}
 
   inline void read_distances(const Ray<T>& ray, int64_t at) const {
     const int64_t last = ray.num_samples - 1;
@@ -83,6 +83,7 @@ struct DistanceField {
   inline T backward_end(const Ray<T>& ray, T remaining, const T* weight, T* grad_sdf) const {
     constexpr int W = kWidth<T>;
     using V = Vec<T, W>;
+    const T inv_s = *a.inv_s;
     // Sums over what lies behind, of weights and of weights times cotangents. Transmittance is the former and what
     // remains: a sum of positive numbers, as exact where next to nothing is left as where all is.
     V transmittance_behind = splat<W>(remaining), gain_behind{}, total{};
@@ -97,10 +98,10 @@ struct DistanceField {
       // H_i and H_{i-1}; S_{i-1} is the sum from here on.
       const V after = transmittance_after * cotangent - (gain_behind + shift_down<1, T, W>(gains, V{}));
       const V before = transmittance * cotangent_before - (gain_behind + gains);
-      const V both = transmittance * (cotangent - cotangent_before);
-      const V one = (falls_after ? after : V{}) - (falls_before ? before : V{});
-      const V slope = load<W>(ray.occupied + i) * ((falls_before & falls_after) ? both : one);  // of inv_s * sdf
-      store(grad_sdf + i, a.inv_s * slope);
+      const V slope = slope_of_distance(load<W>(ray.occupied + i), falls_before, falls_after, transmittance,
+                                        cotangent_before, cotangent, falls_before ? before : V{},
+                                        falls_after ? after : V{});
+      store(grad_sdf + i, inv_s * slope);
       total += slope * sdf;
       transmittance_behind += broadcast<0, T, W>(weights);
       gain_behind += broadcast<0, T, W>(gains);

@@ -40,9 +40,9 @@ struct Field {
         double sdf_scale)
       : op(name), widths(widths_in) {
     constexpr ScalarType dtype = std::is_same_v<T, double> ? ScalarType::Double : ScalarType::Float;
-    check_cpu_tensor(op, "projected", map_in, 4, map_in.scalar_type());
-    check_cpu_tensor(op, "points", points_in, 3, dtype);
-    check_cpu_tensor(op, "parameters", parameters_in, 1, dtype);
+    check_tensor(op, "projected", map_in, 4, map_in.scalar_type());
+    check_tensor(op, "points", points_in, 3, dtype);
+    check_tensor(op, "parameters", parameters_in, 1, dtype);
     batch = map_in.size(0);
     PRED_CHECK(points_in.size(0) == batch && points_in.size(2) == 3, op, ": points must have shape [", batch,
                ", N, 3], got ", shape_text(points_in));
@@ -234,7 +234,7 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
     const auto cotangent = [&](const char* name, const std::optional<Tensor>& tensor,
                                const std::vector<int64_t>& shape) -> const T* {
       if (!tensor) return nullptr;
-      check_cpu_tensor(op, name, *tensor, int64_t(shape.size()), in.points.scalar_type());
+      check_tensor(op, name, *tensor, int64_t(shape.size()), in.points.scalar_type());
       check_sizes(op, name, *tensor, shape);
       kept.push_back(torch::stable::contiguous(*tensor));
       return kept.back().template const_data_ptr<T>();
@@ -243,7 +243,7 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
                                   cotangent("grad_semantics", grad_semantics, {frames, count, classes}),
                                   cotangent("grad_gradient", grad_gradient, {frames, count, 3})};
     const auto saved_rows = [&](const char* name, const Tensor& tensor, int64_t layers) -> S* {
-      check_cpu_tensor(op, name, tensor, 3, projected.scalar_type());
+      check_tensor(op, name, tensor, 3, projected.scalar_type());
       if (tensor.size(0) == 0) return nullptr;
       check_sizes(op, name, tensor, in.saved_shape(layers));
       kept.push_back(torch::stable::contiguous(tensor));

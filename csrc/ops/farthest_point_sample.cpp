@@ -33,7 +33,7 @@ void sample_frame(const PointForest<T>& forest, int64_t frame, const T* xyz, int
 
 Tensor farthest_point_sample(const Tensor& points_in, const Tensor& batch_offsets, int64_t num_samples, int64_t start) {
   const char* op = "farthest_point_sample";
-  check_cpu_tensor(op, "points", points_in, 2, points_in.scalar_type());
+  check_tensor(op, "points", points_in, 2, points_in.scalar_type());
   PRED_CHECK(points_in.size(1) == 3, op, ": points must have shape [N, 3], got ", shape_text(points_in));
   PRED_CHECK(num_samples >= 0, op, ": num_samples must not be negative, got ", num_samples);
   PRED_CHECK(start >= 0, op, ": start must not be negative, got ", start);

@@ -65,7 +65,7 @@ Tensor nms_bev(const Tensor& boxes, const Tensor& scores, double iou_threshold, 
                std::optional<int64_t> post_max) {
   const char* op = "nms_bev";
   const Tensor rows = read_box_rows(op, "boxes", boxes, boxes.scalar_type());
-  check_cpu_tensor(op, "scores", scores, 1, boxes.scalar_type());
+  check_tensor(op, "scores", scores, 1, boxes.scalar_type());
   check_sizes(op, "scores", scores, {rows.size(0)});
   PRED_CHECK(iou_threshold >= 0 && iou_threshold <= 1, op, ": iou_threshold must be in [0, 1], got ", iou_threshold);
   const int64_t most = rows.size(0);

@@ -14,8 +14,8 @@ struct PointQueries {
 
   PointQueries(const char* op, const Tensor& points_in, const Tensor& batch_offsets_in, const Tensor& queries_in,
                const Tensor& query_offsets_in) {
-    check_cpu_tensor(op, "points", points_in, 2, points_in.scalar_type());
-    check_cpu_tensor(op, "queries", queries_in, 2, points_in.scalar_type());
+    check_tensor(op, "points", points_in, 2, points_in.scalar_type());
+    check_tensor(op, "queries", queries_in, 2, points_in.scalar_type());
     PRED_CHECK(points_in.size(1) == 3, op, ": points must have shape [N, 3], got ", shape_text(points_in));
     PRED_CHECK(queries_in.size(1) == 3, op, ": queries must have shape [M, 3], got ", shape_text(queries_in));
     points = torch::stable::contiguous(points_in);

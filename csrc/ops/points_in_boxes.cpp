@@ -18,7 +18,7 @@ constexpr int64_t kGrain = 2048;
 PRED_KERNELS_BY_TYPE(PointsInBoxesKernels, points_in_boxes)
 
 Tensor read_points(const char* op, const Tensor& points) {
-  check_cpu_tensor(op, "points", points, 2, points.scalar_type());
+  check_tensor(op, "points", points, 2, points.scalar_type());
   PRED_CHECK(points.size(1) == 3, op, ": points must have shape [N, 3], got ", shape_text(points));
   return torch::stable::contiguous(points);
 }

@@ -29,8 +29,8 @@ struct Projection {
   ProjectArgs<S> args{};
 
   Projection(const char* op, const Tensor& bev_in, const Tensor& weight_in, bool backward) {
-    check_cpu_tensor(op, "bev", bev_in, 4, bev_in.scalar_type());
-    check_cpu_tensor(op, "weight", weight_in, 2, std::is_same_v<T, double> ? ScalarType::Double : ScalarType::Float);
+    check_tensor(op, "bev", bev_in, 4, bev_in.scalar_type());
+    check_tensor(op, "weight", weight_in, 2, std::is_same_v<T, double> ? ScalarType::Double : ScalarType::Float);
     PRED_CHECK(weight_in.size(1) == bev_in.size(1) && weight_in.size(0) >= 1 && weight_in.size(1) >= 1, op,
                ": weight must have shape [hidden, ", bev_in.size(1), "], both at least 1, got ", shape_text(weight_in));
     bev = torch::stable::contiguous(bev_in, MemoryFormat::ChannelsLast);
@@ -77,7 +77,7 @@ std::tuple<Tensor, Tensor> project_bev_backward(const Tensor& grad_in, const Ten
   const char* op = "project_bev_backward";
   return PRED_DISPATCH_FACTOR(op, bev.scalar_type(), [&] {
     Projection<S> in(op, bev, weight, true);
-    check_cpu_tensor(op, "grad", grad_in, 4, bev.scalar_type());
+    check_tensor(op, "grad", grad_in, 4, bev.scalar_type());
     check_sizes(op, "grad", grad_in, {bev.size(0), weight.size(0), bev.size(2), bev.size(3)});
     const Tensor grad = torch::stable::contiguous(grad_in, MemoryFormat::ChannelsLast);
     in.args.grad = storage<S>(grad);

@@ -12,14 +12,20 @@ namespace pred {
 struct RayRows {
   const int64_t* offsets;  // [R + 1], or null: every ray has num_samples
   int64_t num_samples;
+  int64_t num_rows;  // P
 };
 
+// Rows exist, whatever the offsets are: not everyone can check them beforehand.
 PRED_HOST_DEVICE int64_t ray_begin(const RayRows& rows, int64_t ray) {
-  return rows.offsets ? rows.offsets[ray] : ray * rows.num_samples;
+  if (!rows.offsets) return ray * rows.num_samples;
+  const int64_t begin = rows.offsets[ray] < 0 ? 0 : rows.offsets[ray];
+  return begin < rows.num_rows ? begin : rows.num_rows;
 }
 
 PRED_HOST_DEVICE int64_t ray_count(const RayRows& rows, int64_t ray) {
-  return rows.offsets ? rows.offsets[ray + 1] - rows.offsets[ray] : rows.num_samples;
+  if (!rows.offsets) return rows.num_samples;
+  const int64_t count = ray_begin(rows, ray + 1) - ray_begin(rows, ray);
+  return count < 0 ? 0 : count;
 }
 
 }  // namespace pred

@@ -45,7 +45,7 @@ struct SampleGrid {
 
     Inputs(const char* suffix, const Tensor& map_in, const Tensor& grid_in, bool border, bool align_corners)
         : op(concat(Op::kName, suffix)) {
-      check_cpu_tensor(op.c_str(), Op::kMap, map_in, 2 + kAxes, map_in.scalar_type());
+      check_tensor(op.c_str(), Op::kMap, map_in, 2 + kAxes, map_in.scalar_type());
       batch = map_in.size(0);
       check_geometry("grid", grid_in);
       PRED_CHECK(grid_in.size(0) == batch && grid_in.size(2) == kAxes, op, ": grid must have shape [", batch, ", N, ",
@@ -72,13 +72,13 @@ struct SampleGrid {
     // The gradients of the op's outputs. One alone is enough with grad_slopes.
     void set_grads(const std::optional<Tensor>& of_values, const std::optional<Tensor>& of_slopes) {
       if (of_values) {
-        check_cpu_tensor(op.c_str(), "grad", *of_values, 3, map.scalar_type());
+        check_tensor(op.c_str(), "grad", *of_values, 3, map.scalar_type());
         check_sizes(op.c_str(), "grad", *of_values, {batch, args.num_samples, args.channels});
         grad = torch::stable::contiguous(*of_values);
         args.grad = storage<S>(grad);
       }
       if (of_slopes) {
-        check_cpu_tensor(op.c_str(), "grad_grads", *of_slopes, 4, map.scalar_type());
+        check_tensor(op.c_str(), "grad_grads", *of_slopes, 4, map.scalar_type());
         check_sizes(op.c_str(), "grad_grads", *of_slopes, {batch, args.num_samples, kAxes, args.channels});
         grad_slopes = torch::stable::contiguous(*of_slopes);
         args.grad_slopes = storage<S>(grad_slopes);
@@ -88,7 +88,7 @@ struct SampleGrid {
     void set_cotangents(const std::optional<Tensor>& of_map, const std::optional<Tensor>& of_grid) {
       if (of_map) {
         const std::string name = concat("grad_grad_", Op::kMap);
-        check_cpu_tensor(op.c_str(), name.c_str(), *of_map, 2 + kAxes, map.scalar_type());
+        check_tensor(op.c_str(), name.c_str(), *of_map, 2 + kAxes, map.scalar_type());
         check_sizes(op.c_str(), name.c_str(), *of_map, sizes(map));
         grad_grad_map = torch::stable::contiguous(*of_map, kChannelsLast);
         args.grad_grad_map = storage<S>(grad_grad_map);
@@ -108,7 +108,7 @@ struct SampleGrid {
 
    private:
     void check_geometry(const char* name, const Tensor& tensor) const {
-      check_cpu_tensor(op.c_str(), name, tensor, 3, tensor.scalar_type());
+      check_tensor(op.c_str(), name, tensor, 3, tensor.scalar_type());
       constexpr ScalarType dtype = std::is_same_v<T, double> ? ScalarType::Double : ScalarType::Float;
       PRED_CHECK(tensor.scalar_type() == dtype, op, ": ", name, " must be ",
                  dtype == ScalarType::Double ? "float64 with a float64 " : "float32 with a float32 or half ", Op::kMap);

@@ -38,9 +38,9 @@ Tensor sample_sections(const char* op, const char* name, bool merged, const Samp
                        const PdfOptions& options) {
   constexpr int64_t kMost = int64_t(1) << 30;
   const ScalarType dtype = edges_in.scalar_type();
-  check_cpu_tensor(op, name, edges_in, 2, dtype);
-  check_cpu_tensor(op, "weights", weights_in, 2, dtype);
-  check_cpu_tensor(op, "u", u_in, u_in.dim() == 1 ? 1 : 2, dtype);
+  check_tensor(op, name, edges_in, 2, dtype);
+  check_tensor(op, "weights", weights_in, 2, dtype);
+  check_tensor(op, "u", u_in, u_in.dim() == 1 ? 1 : 2, dtype);
   const int64_t rays = edges_in.size(0), num_edges = edges_in.size(1), num_new = u_in.size(u_in.dim() - 1);
   const int64_t num_weights = weights_in.size(1);
   PRED_CHECK(num_edges >= 2 && num_edges < kMost, op, ": ", name, " must have at least 2 and fewer than 2^30 samples ",

@@ -21,16 +21,16 @@ namespace pred {
 template <typename T>
 struct PairAlphaArgs {
   RayRows rows;
-  const T* sdf;  // [P]
-  T inv_s;
+  const T* sdf;    // [P]
+  const T* inv_s;  // one
   bool last_opaque;
 };
 
 template <typename T>
 struct SectionAlphaArgs {
   const T *sdf, *cosine, *length;  // [P]
-  T inv_s;
-  SectionShape<T> shape;
+  const T *inv_s, *anneal;         // one each
+  T eps;
 };
 
 // Gradients of the inputs; null where not wanted.
@@ -44,19 +44,35 @@ struct DensityAlphaArgs {
   const T *density, *length;  // [P]
 };
 
+// exp(-x) and 1 - exp(-x) for any x; the latter with full relative accuracy near 0.
+template <typename T>
+struct Decay {
+  T kept, lost;
+};
+
+template <typename T>
+PRED_HOST_DEVICE Decay<T> decay(const ExpScale<T>& one, T x) {
+  const Exp<T> e = exp_nonpositive(one, negative_magnitude(x));
+  const T inverse = T(1) / e.exp;
+  return {x < T(0) ? inverse : e.exp, x < T(0) ? e.expm1 * inverse : -e.expm1};
+}
+
+// Samples whose parts of the gradient of inv_s are added up before the parts are.
+constexpr int64_t kAlphaGroup = 1024;
+
 template <typename T>
 struct SdfToAlphaKernels {
-  // Ranges count rays; they are worked on as one row.
+  // Ranges count rays; loops work on them as one row.
   void (*pair)(const PairAlphaArgs<T>&, T* alpha, int64_t begin, int64_t end);
-  // grad, grad_sdf [P]; scratch holds 3 times the samples of the range. Either output may be null; grad_inv_s is the
-  // range's part.
+  // grad, grad_sdf [P]. Either output may be null. Loops: grad_inv_s is the range's part, scratch holds 3 times the
+  // samples of the range. Launched: grad_inv_s [R].
   void (*pair_backward)(const PairAlphaArgs<T>&, const T* grad, T* grad_sdf, double* grad_inv_s, T* scratch,
                         int64_t begin, int64_t end);
   // Ranges count samples.
   void (*section)(const SectionAlphaArgs<T>&, T* alpha, int64_t begin, int64_t end);
-  // Returns the range's part of the gradient of inv_s.
-  double (*section_backward)(const SectionAlphaArgs<T>&, const T* grad, const SectionAlphaGradients<T>&, int64_t begin,
-                             int64_t end);
+  // parts of the gradient of inv_s: that of the range, or, launched, of each group.
+  void (*section_backward)(const SectionAlphaArgs<T>&, const T* grad, const SectionAlphaGradients<T>&, double* parts,
+                           int64_t begin, int64_t end);
   void (*density)(const DensityAlphaArgs<T>&, T* alpha, int64_t begin, int64_t end);
   // Either output may be null.
   void (*density_backward)(const DensityAlphaArgs<T>&, const T* grad, T* grad_density, T* grad_length, int64_t begin,

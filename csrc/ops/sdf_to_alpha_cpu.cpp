@@ -28,7 +28,7 @@ static inline double sum(const T* __restrict x, int64_t n) {
 template <typename T>
 static void pair(const PairAlphaArgs<T>& a, T* alpha, int64_t begin, int64_t end) {
   const int64_t first = ray_begin(a.rows, begin), count = ray_begin(a.rows, end) - first;
-  const ExpScale<T> s = exp_scale(a.inv_s);
+  const ExpScale<T> s = exp_scale(*a.inv_s);
   const T* __restrict sdf = a.sdf + first;
   T* __restrict out = alpha + first;
   for (int64_t i = 0; i < count - 1; ++i) {
@@ -45,8 +45,8 @@ static void pair_backward(const PairAlphaArgs<T>& a, const T* grad, T* grad_sdf,
                           int64_t begin, int64_t end) {
   const int64_t first = ray_begin(a.rows, begin), count = ray_begin(a.rows, end) - first;
   if (count == 0) return;
-  const T inv_s = a.inv_s;
-  const ExpScale<T> s = exp_scale(a.inv_s);
+  const T inv_s = *a.inv_s;
+  const ExpScale<T> s = exp_scale(inv_s);
   const T* __restrict sdf = a.sdf + first;
   const T* __restrict row = grad + first;
   T* __restrict here = scratch;               // gradient of s d_i through alpha_i
@@ -74,15 +74,15 @@ static void pair_backward(const PairAlphaArgs<T>& a, const T* grad, T* grad_sdf,
 
 template <bool kPublished, typename T>
 static inline void section_range(const SectionAlphaArgs<T>& a, T* __restrict alpha, int64_t begin, int64_t end) {
-  const ExpScale<T> s = exp_scale(a.inv_s);
-  const SectionShape<T> shape = a.shape;
+  const ExpScale<T> s = exp_scale(*a.inv_s);
+  const SectionShape<T> shape{*a.anneal, a.eps};
   const T* __restrict sdf = a.sdf, * __restrict cosine = a.cosine, * __restrict length = a.length;
   for (int64_t i = begin; i < end; ++i) alpha[i] = section_alpha<kPublished>(s, shape, sdf[i], cosine[i], length[i]);
 }
 
 template <typename T>
 static void section(const SectionAlphaArgs<T>& a, T* alpha, int64_t begin, int64_t end) {
-  a.shape.eps > T(0) ? section_range<true>(a, alpha, begin, end) : section_range<false>(a, alpha, begin, end);
+  a.eps > T(0) ? section_range<true>(a, alpha, begin, end) : section_range<false>(a, alpha, begin, end);
 }
 
 template <typename T>
@@ -93,9 +93,9 @@ static inline void copy(const T* __restrict from, T* __restrict to, int64_t n) {
 template <bool kPublished, typename T>
 static inline double section_backward_range(const SectionAlphaArgs<T>& a, const T* grad,
                                             const SectionAlphaGradients<T>& out, int64_t begin, int64_t end) {
-  const T inv_s = a.inv_s;
-  const ExpScale<T> s = exp_scale(a.inv_s);
-  const SectionShape<T> shape = a.shape;
+  const T inv_s = *a.inv_s;
+  const ExpScale<T> s = exp_scale(inv_s);
+  const SectionShape<T> shape{*a.anneal, a.eps};
   alignas(64) T of_sdf[kBlock], of_cosine[kBlock], of_length[kBlock], of_inv_s[kBlock];
   double total = 0;
   for (int64_t block = begin; block < end; block += kBlock) {
@@ -118,23 +118,10 @@ static inline double section_backward_range(const SectionAlphaArgs<T>& a, const 
 }
 
 template <typename T>
-static double section_backward(const SectionAlphaArgs<T>& a, const T* grad, const SectionAlphaGradients<T>& out,
-                               int64_t begin, int64_t end) {
-  return a.shape.eps > T(0) ? section_backward_range<true>(a, grad, out, begin, end)
-                            : section_backward_range<false>(a, grad, out, begin, end);
-}
-
-// exp(-x) and 1 - exp(-x) for any x; the latter with full relative accuracy near 0.
-template <typename T>
-struct Decay {
-  T kept, lost;
-};
-
-template <typename T>
-static inline Decay<T> decay(const ExpScale<T>& one, T x) {
-  const Exp<T> e = exp_nonpositive(one, negative_magnitude(x));
-  const T inverse = T(1) / e.exp;
-  return {x < T(0) ? inverse : e.exp, x < T(0) ? e.expm1 * inverse : -e.expm1};
+static void section_backward(const SectionAlphaArgs<T>& a, const T* grad, const SectionAlphaGradients<T>& out,
+                             double* part, int64_t begin, int64_t end) {
+  *part = a.eps > T(0) ? section_backward_range<true>(a, grad, out, begin, end)
+                       : section_backward_range<false>(a, grad, out, begin, end);
 }
 
 template <typename T>

@@ -77,8 +77,8 @@ std::tuple<Tensor, Tensor> forward(const char* op, const Tensor& features_in, co
 std::tuple<Tensor, Tensor> segment_reduce(const Tensor& features, const Tensor& index, int64_t num_segments,
                                           std::string reduce) {
   const char* op = "segment_reduce";
-  check_cpu_tensor(op, "features", features, 2, features.scalar_type());
-  check_cpu_tensor(op, "index", index, 1, ScalarType::Long);
+  check_tensor(op, "features", features, 2, features.scalar_type());
+  check_tensor(op, "index", index, 1, ScalarType::Long);
   PRED_CHECK(index.size(0) == features.size(0), op, ": index must have shape [", features.size(0), "], got ",
              shape_text(index));
   PRED_CHECK(num_segments >= 0, op, ": num_segments must not be negative, got ", num_segments);
@@ -92,11 +92,11 @@ std::tuple<Tensor, Tensor> segment_reduce(const Tensor& features, const Tensor& 
 Tensor segment_reduce_backward(const Tensor& grad_in, const Tensor& index_in, const Tensor& saved_in,
                                std::string reduce) {
   const char* op = "segment_reduce_backward";
-  check_cpu_tensor(op, "grad", grad_in, 2, grad_in.scalar_type());
-  check_cpu_tensor(op, "index", index_in, 1, ScalarType::Long);
+  check_tensor(op, "grad", grad_in, 2, grad_in.scalar_type());
+  check_tensor(op, "index", index_in, 1, ScalarType::Long);
   const SegmentReduction how = reduction(op, reduce);
   const int64_t num_segments = grad_in.size(0), channels = grad_in.size(1), num_rows = index_in.size(0);
-  check_cpu_tensor(op, "saved", saved_in, how == SegmentReduction::kMax ? 2 : 1, ScalarType::Int);
+  check_tensor(op, "saved", saved_in, how == SegmentReduction::kMax ? 2 : 1, ScalarType::Int);
   const bool fits = how == SegmentReduction::kSum || (saved_in.size(0) == num_segments &&
                                                       (how == SegmentReduction::kMean || saved_in.size(1) == channels));
   PRED_CHECK(fits, op, ": saved must belong to grad of shape ", shape_text(grad_in), ", got ", shape_text(saved_in));

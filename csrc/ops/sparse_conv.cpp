@@ -27,8 +27,8 @@ struct Problem {
 
   Problem(const char* op, const Tensor& features_in, const Tensor& weight_in, const Tensor& out_to_in_in,
           const Tensor& in_to_out_in) {
-    check_cpu_tensor(op, "features", features_in, 2, features_in.scalar_type());
-    check_cpu_tensor(op, "weight", weight_in, 3, features_in.scalar_type());
+    check_tensor(op, "features", features_in, 2, features_in.scalar_type());
+    check_tensor(op, "weight", weight_in, 3, features_in.scalar_type());
     inputs = features_in.size(1), outputs = weight_in.size(0), taps = weight_in.size(1);
     PRED_CHECK(weight_in.size(2) == inputs, op, ": weight must have shape [O, K, ", inputs, "], got ",
                shape_text(weight_in));
@@ -120,7 +120,7 @@ Tensor sparse_conv(const Tensor& features, const Tensor& weight, const std::opti
     const Problem in(op, features, weight, out_to_in, in_to_out);
     Tensor bias;
     if (bias_in) {
-      check_cpu_tensor(op, "bias", *bias_in, 1, features.scalar_type());
+      check_tensor(op, "bias", *bias_in, 1, features.scalar_type());
       check_sizes(op, "bias", *bias_in, {in.outputs});
       bias = torch::stable::contiguous(*bias_in);
     }
@@ -138,7 +138,7 @@ std::tuple<Tensor, Tensor> sparse_conv_backward(const Tensor& grad_in, const Ten
   const char* op = "sparse_conv_backward";
   return PRED_DISPATCH_STORAGE(op, features.scalar_type(), [&] {
     const Problem in(op, features, weight, out_to_in, in_to_out);
-    check_cpu_tensor(op, "grad", grad_in, 2, features.scalar_type());
+    check_tensor(op, "grad", grad_in, 2, features.scalar_type());
     check_sizes(op, "grad", grad_in, {in.rows_out, in.outputs});
     const Tensor grad = torch::stable::contiguous(grad_in);
     Tensor out_features = torch::stable::new_empty(in.features, {need_features ? in.rows_in : 0, in.inputs});

@@ -22,7 +22,7 @@ int64_t row_grain(int64_t channels, int64_t taps) { return 1 + 16384 / (channels
 std::tuple<Tensor, Tensor> sparse_max_pool(const Tensor& features_in, const Tensor& out_to_in,
                                            const Tensor& in_to_out) {
   const char* op = "sparse_max_pool";
-  check_cpu_tensor(op, "features", features_in, 2, features_in.scalar_type());
+  check_tensor(op, "features", features_in, 2, features_in.scalar_type());
   const int64_t rows_in = features_in.size(0), rows_out = table_rows(op, "out_to_in", out_to_in);
   const int64_t taps = out_to_in.size(1), channels = features_in.size(1);
   const Tensor table = checked_table(op, "out_to_in", out_to_in, rows_out, taps, rows_in);
@@ -43,9 +43,9 @@ std::tuple<Tensor, Tensor> sparse_max_pool(const Tensor& features_in, const Tens
 
 Tensor sparse_max_pool_backward(const Tensor& grad_in, const Tensor& winner_in, const Tensor& in_to_out) {
   const char* op = "sparse_max_pool_backward";
-  check_cpu_tensor(op, "grad", grad_in, 2, grad_in.scalar_type());
+  check_tensor(op, "grad", grad_in, 2, grad_in.scalar_type());
   const int64_t rows_out = grad_in.size(0), channels = grad_in.size(1);
-  check_cpu_tensor(op, "winner", winner_in, 2, ScalarType::Int);
+  check_tensor(op, "winner", winner_in, 2, ScalarType::Int);
   check_sizes(op, "winner", winner_in, {rows_out, channels});
   const int64_t rows_in = table_rows(op, "in_to_out", in_to_out), taps = in_to_out.size(1);
   const Tensor table = checked_table(op, "in_to_out", in_to_out, rows_in, taps, rows_out);

@@ -17,7 +17,7 @@ namespace pred {
 // A table [rows, taps] whose numbers are rows of another, or -1.
 inline Tensor checked_table(const char* op, const char* name, const Tensor& table_in, int64_t rows, int64_t taps,
                             int64_t numbers) {
-  check_cpu_tensor(op, name, table_in, 2, ScalarType::Int);
+  check_tensor(op, name, table_in, 2, ScalarType::Int);
   check_sizes(op, name, table_in, {rows, taps});
   const Tensor table = torch::stable::contiguous(table_in);
   const int32_t* data = table.const_data_ptr<int32_t>();

@@ -118,7 +118,7 @@ Outputs voxelize_hard(const Tensor& points_in, const Tensor& batch_offsets, std:
                       std::vector<double> point_range, std::vector<int64_t> grid_size, int64_t max_points,
                       int64_t max_voxels) {
   const char* op = "voxelize_hard";
-  check_cpu_tensor(op, "points", points_in, 2, points_in.scalar_type());
+  check_tensor(op, "points", points_in, 2, points_in.scalar_type());
   PRED_CHECK(max_points >= 1, op, ": max_points must be at least 1, got ", max_points);
   PRED_CHECK(max_voxels >= 1, op, ": max_voxels must be at least 1, got ", max_voxels);
   const Tensor points = torch::stable::contiguous(points_in);
@@ -134,8 +134,8 @@ Outputs voxelize_hard(const Tensor& points_in, const Tensor& batch_offsets, std:
 
 Tensor voxelize_hard_backward(const Tensor& grad_in, const Tensor& point_to_slot_in) {
   const char* op = "voxelize_hard_backward";
-  check_cpu_tensor(op, "grad", grad_in, 3, grad_in.scalar_type());
-  check_cpu_tensor(op, "point_to_slot", point_to_slot_in, 1, ScalarType::Long);
+  check_tensor(op, "grad", grad_in, 3, grad_in.scalar_type());
+  check_tensor(op, "point_to_slot", point_to_slot_in, 1, ScalarType::Long);
   const Tensor grad = torch::stable::contiguous(grad_in);
   const Tensor point_to_slot = torch::stable::contiguous(point_to_slot_in);
   const int64_t* slot_of = point_to_slot.const_data_ptr<int64_t>();

@@ -49,7 +49,7 @@ struct VoxelizeInputs {
   VoxelizeInputs(const char* op, const Tensor& points, const Tensor& batch_offsets, std::vector<double> voxel_size,
                  std::vector<double> point_range, std::vector<int64_t> grid_size)
       : points(points), voxel_size(voxel_size), point_range(point_range), grid_size(grid_size) {
-    check_cpu_tensor(op, "points", points, 2, points.scalar_type());
+    check_tensor(op, "points", points, 2, points.scalar_type());
     PRED_CHECK(points.size(1) >= 3, op, ": points must have shape [N, C] with C >= 3, got ", shape_text(points));
     PRED_CHECK(voxel_size.size() == 3 && point_range.size() == 6 && grid_size.size() == 3, op,
                ": voxel_size, point_range and grid_size must hold 3, 6 and 3 numbers, got ", voxel_size.size(), ", ",
