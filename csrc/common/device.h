@@ -76,11 +76,11 @@ struct OnDevice<function, Name> {
 };
 
 // In a STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m): the op of this name.
-#define PRED_IMPL(m, name, function)                                   \
-  do {                                                                 \
-    struct Name {                                                      \
-      static const char* text() { return "pred::" name; }              \
-    };                                                                 \
+#define PRED_IMPL(m, name, function)                                    \
+  do {                                                                  \
+    struct Name {                                                       \
+      static const char* text() { return "pred::" name; }               \
+    };                                                                  \
     m.impl(name, TORCH_BOX((&::pred::OnDevice<function, Name>::call))); \
   } while (0)
 #else

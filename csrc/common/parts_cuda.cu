@@ -3,7 +3,6 @@
 //
 // One block. A thread owns every 256th part, a warp the sums of its threads, the first thread those of the warps.
 #include "common/parts.h"
-
 #include "common/warp.cuh"
 
 namespace pred {

@@ -15,6 +15,7 @@
 #include <vector>
 
 #include "common/allocate.h"
+#include "common/bits.h"
 #include "common/check.h"
 #include "common/parallel.h"
 
@@ -29,13 +30,6 @@ struct SortedItems {
   int64_t num_blocks;
   int64_t block_begin(int64_t block) const { return count * block / num_blocks; }
 };
-
-// Bits that hold the numbers 0 .. count - 1.
-inline int bits_for(int64_t count) {
-  int bits = 0;
-  while (bits < 63 && (int64_t(1) << bits) < count) ++bits;
-  return bits;
-}
 
 // pack(items, begin, end) -> count writes the items of the rows [begin, end) that take part, in order, from
 // `items` on. They are sorted by their bits from row_bits to row_bits + key_bits.

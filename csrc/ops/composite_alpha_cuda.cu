@@ -24,8 +24,7 @@ struct GivenField {
 
 template <bool kSource, bool kValues, typename S, typename T = Compute<S>>
 __global__ void __launch_bounds__(kThreads)
-    backward_kernel(CompositeAlphaArgs<S> a, CompositeCotangents<S> grad, CompositeGradients<S> out,
-                    int64_t num_rays) {
+    backward_kernel(CompositeAlphaArgs<S> a, CompositeCotangents<S> grad, CompositeGradients<S> out, int64_t num_rays) {
   __shared__ Tile<T> tiles[kThreads / kWarp];
   Tile<T>& tile = tiles[threadIdx.x / kWarp];
   const GivenField<S> field(a);
@@ -84,16 +83,17 @@ template <typename S, typename T = Compute<S>>
 void backward(const CompositeAlphaArgs<S>& a, const CompositeSaved<T>&, const CompositeCotangents<S>& grad,
               const CompositeGradients<S>& out, T*, int64_t, int64_t, int64_t num_rays) {
   const bool source = out.source != nullptr, values = out.values != nullptr;
-  const auto kernel = source ? values ? backward_kernel<true, true, S> : backward_kernel<true, false, S>
-                             : values ? backward_kernel<false, true, S> : backward_kernel<false, false, S>;
+  const auto kernel = source   ? values ? backward_kernel<true, true, S> : backward_kernel<true, false, S>
+                      : values ? backward_kernel<false, true, S>
+                               : backward_kernel<false, false, S>;
   launch_warps(kernel, num_rays, a, grad, out, num_rays);
 }
 
 }  // namespace
 
-#define PRED_TABLE(S, name)                                 \
-  const CompositeAlphaKernels<S> composite_alpha_##name = { \
-      nullptr, forward<GivenField<S>, CompositeAlphaArgs<S>>, backward<S>};
+#define PRED_TABLE(S, name)                                                                                        \
+  const CompositeAlphaKernels<S> composite_alpha_##name = {nullptr, forward<GivenField<S>, CompositeAlphaArgs<S>>, \
+                                                           backward<S>};
 PRED_TABLE(float, f32)
 PRED_TABLE(double, f64)
 PRED_TABLE(BFloat16, bf16)

@@ -208,7 +208,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> composite_backward(
   int64_t bytes = in.args.channels * int64_t(sizeof(S));
   for (const int64_t size : in.samples) bytes *= size;
   const CompositeGradients<S> out{need.source ? mutable_storage<T>(out_source) : nullptr,
-                                  need.inv_s ? mutable_storage<double>(per_ray) : nullptr, need.t ? mutable_storage<T>(out_t) : nullptr,
+                                  need.inv_s ? mutable_storage<double>(per_ray) : nullptr,
+                                  need.t ? mutable_storage<T>(out_t) : nullptr,
                                   need.values ? mutable_storage<S>(out_values) : nullptr, bytes >= kStreamBytes};
   in.for_rays(kernels, [&](T* scratch, int64_t longest, int64_t begin, int64_t end) {
     kernels.backward(in.args, saved, grad, out, scratch, longest, begin, end);

@@ -101,8 +101,8 @@ __global__ void __launch_bounds__(kThreads) forward_kernel(Args a, CompositeOutp
 template <typename T>
 using Tile = T[kWarp][kWarp + 1];
 
-// The samples of a turn, from row `at` on, where the ray has `left` more: returns sum_c values[i, c] grad[c] to the lane
-// of sample i (kDot), and writes the gradient of values, weight_i grad[c] (kOuter).
+// The samples of a turn, from row `at` on, where the ray has `left` more: returns sum_c values[i, c] grad[c] to the
+// lane of sample i (kDot), and writes the gradient of values, weight_i grad[c] (kOuter).
 template <bool kDot, bool kOuter, typename S, typename T = Compute<S>>
 PRED_DEVICE_ONLY T channel_gradients(const CompositeArgs<S>& a, const CompositeCotangents<S>& grad,
                                      const CompositeGradients<S>& out, T weight, int64_t ray, int64_t at, int64_t left,

@@ -23,7 +23,8 @@ struct CompositeRaysArgs : CompositeArgs<S> {
   bool last_opaque;
 };
 
-// dL/d(s d_i), from Phi(-s d_i), T_i, A_{i-1}, A_i, H_{i-1} and H_i; falls: the distance does from i - 1 to i, to i + 1.
+// dL/d(s d_i), from Phi(-s d_i), T_i, A_{i-1}, A_i, H_{i-1} and H_i; falls: the distance does from i - 1 to i, to i
+// + 1.
 template <typename V, typename M>
 PRED_HOST_DEVICE V slope_of_distance(V occupied, M falls_before, M falls_after, V light, V cotangent_before,
                                      V cotangent, V h_before, V h) {

@@ -98,9 +98,9 @@ struct DistanceField {
       // H_i and H_{i-1}; S_{i-1} is the sum from here on.
       const V after = transmittance_after * cotangent - (gain_behind + shift_down<1, T, W>(gains, V{}));
       const V before = transmittance * cotangent_before - (gain_behind + gains);
-      const V slope = slope_of_distance(load<W>(ray.occupied + i), falls_before, falls_after, transmittance,
-                                        cotangent_before, cotangent, falls_before ? before : V{},
-                                        falls_after ? after : V{});
+      const V slope =
+          slope_of_distance(load<W>(ray.occupied + i), falls_before, falls_after, transmittance, cotangent_before,
+                            cotangent, falls_before ? before : V{}, falls_after ? after : V{});
       store(grad_sdf + i, inv_s * slope);
       total += slope * sdf;
       transmittance_behind += broadcast<0, T, W>(weights);

@@ -77,7 +77,8 @@ __global__ void __launch_bounds__(kThreads)
       own.falls = i + 1 < count && own.sdf > next_sdf;
       const T weights = suffix_sum(weight), gains = suffix_sum(there ? weight * own.cotangent : T(0));
       // T_{i+1} and S_i
-      const T light_after = light_behind + from_behind(weights, T(0)), gain_after = gain_behind + from_behind(gains, T(0));
+      const T light_after = light_behind + from_behind(weights, T(0)),
+              gain_after = gain_behind + from_behind(gains, T(0));
       own.h = own.falls ? light_after * own.cotangent - gain_after : T(0);
       const Sample<T> next = sample_behind(own, behind);
       if (i + 1 < count) {
@@ -105,16 +106,17 @@ template <typename S, typename T = Compute<S>>
 void backward(const CompositeRaysArgs<S>& a, const CompositeSaved<T>& saved, const CompositeCotangents<S>& grad,
               const CompositeGradients<S>& out, T*, int64_t, int64_t, int64_t num_rays) {
   const bool source = out.source || out.inv_s, values = out.values != nullptr;
-  const auto kernel = source ? values ? backward_kernel<true, true, S> : backward_kernel<true, false, S>
-                             : values ? backward_kernel<false, true, S> : backward_kernel<false, false, S>;
+  const auto kernel = source   ? values ? backward_kernel<true, true, S> : backward_kernel<true, false, S>
+                      : values ? backward_kernel<false, true, S>
+                               : backward_kernel<false, false, S>;
   launch_warps(kernel, num_rays, a, saved, grad, out, num_rays);
 }
 
 }  // namespace
 
-#define PRED_TABLE(S, name)                               \
-  const CompositeRaysKernels<S> composite_rays_##name = { \
-      nullptr, forward<DistanceField<S>, CompositeRaysArgs<S>>, backward<S>};
+#define PRED_TABLE(S, name)                                                                                        \
+  const CompositeRaysKernels<S> composite_rays_##name = {nullptr, forward<DistanceField<S>, CompositeRaysArgs<S>>, \
+                                                         backward<S>};
 PRED_TABLE(float, f32)
 PRED_TABLE(double, f64)
 PRED_TABLE(BFloat16, bf16)

@@ -60,6 +60,22 @@ struct SampleGridBand {
   Compute<S>* sums;  // [(D,) end - begin, W, C] scratch; null where the result itself can hold them
 };
 
+// Rows of gradients that one sample sends to its cells: that of the value, and with kRows = 1 + Axes those of the
+// value's derivatives, with kRows = kAlong that of its derivative along a direction.
+constexpr int kAlong = 2;
+
+// The weights of a sample's value and, with kOuts = 1 + Axes, of the value's derivatives.
+template <int kOuts, typename T, int Axes>
+PRED_HOST_DEVICE void forward_weights(const LinearStencil<T, Axes>& s, T (&weight)[kOuts][1 << Axes]) {
+  linear_weights(s, 0, weight[0]);
+  for (int m = 1; m < kOuts; ++m) {
+    linear_weights(s, 1 << (m - 1), weight[m]);
+    if (weight[0][0] != weight[0][0]) {  // slopes do not depend on every coordinate, but must show that one is NaN
+      for (T& w : weight[m]) w = weight[0][0];
+    }
+  }
+}
+
 // Ranges count samples over all maps (b * N + n).
 template <typename S, int Axes>
 struct SampleGridKernels {
@@ -74,6 +90,9 @@ struct SampleGridKernels {
   void (*backward_grid)(const Args&, T* grad_grid, int64_t begin, int64_t end);
   // Either output may be null.
   void (*double_backward)(const Args&, S* grad_out, T* grad_grid, int64_t begin, int64_t end);
+  // Launched, in place of pack and scatter_band: writes all of grad_map. The workspace has so many bytes.
+  int64_t (*scatter_bytes)(const Args&, int64_t batch);
+  void (*scatter)(const Args&, int64_t batch, bool along_direction, S* grad_map, char* workspace);
 };
 
 template <typename S>

@@ -65,7 +65,7 @@ struct SampleGrid {
       }
       args.border = border;
       args.align_corners = align_corners;
-      zeros = allocate_zeros<S>(num_samples() > 0 ? args.channels : 0);
+      zeros = allocate_zeros<S>(num_samples() > 0 && !kLaunch ? args.channels : 0);
       args.zeros = zeros.get();
     }
 
@@ -186,7 +186,8 @@ struct SampleGrid {
     });
   }
 
-  // Adds every sample's gradient to its cells; grad_grid, where not null, gets the samples' grid gradients on the way.
+  // Adds every sample's gradient to its cells. grad_grid, where not null, gets the samples' grid gradients on the way;
+  // not from kernels that are launched.
   template <typename S>
   static Tensor scatter(const char* op, const Tensor& map, const SampleGridArgs<S, kAxes>& a, bool along_direction,
                         Compute<S>* grad_grid) {
@@ -206,6 +207,13 @@ struct SampleGrid {
     PRED_CHECK(key_bits + order.number_bits < 64, op,
                ": cells times samples of the map, both rounded up to powers of 2, must be fewer than 2^64, got 2^",
                key_bits + order.number_bits);
+    Tensor grad_map = new_channels_last(map);
+    S* out = mutable_storage<S>(grad_map);
+    if constexpr (kLaunch) {
+      const Tensor workspace = torch::stable::new_empty(map, {k.scatter_bytes(a, batch)}, ScalarType::Byte);
+      k.scatter(a, batch, along_direction, out, mutable_storage<char>(workspace));
+      return grad_map;
+    }
     const auto sorted = sort_rows<uint64_t>(
         num_samples, order.number_bits, key_bits,
         [&](uint64_t* items, int64_t begin, int64_t end) { return k.pack(a, order, items, begin, end); });
@@ -219,8 +227,6 @@ struct SampleGrid {
     };
     const int64_t height = a.size[1], num_bands = (height + kBandRows - 1) / kBandRows;
     const int64_t depth = kAxes == 3 ? a.size[kAxes - 1] : 1;
-    Tensor grad_map = new_channels_last(map);
-    S* out = mutable_storage<S>(grad_map);
     parallel(batch * num_bands, 1, [&](int64_t begin, int64_t end) {
       std::unique_ptr<Compute<S>[]> sums;
       if (!std::is_same_v<S, Compute<S>>) sums = allocate_array<Compute<S>>(depth * kBandRows * a.stride[1]);
@@ -261,9 +267,10 @@ struct SampleGrid {
         data = mutable_storage<T>(grad_grid);
       }
       if (need_map) {
-        if (need_grid) torch::stable::zero_(grad_grid);  // samples that touch nothing are not visited
+        if (need_grid && !kLaunch) torch::stable::zero_(grad_grid);  // samples that touch nothing are not visited
         grad_map = scatter<S>(in.op.c_str(), in.map, in.args, false, data);
-      } else if (need_grid) {
+      }
+      if (need_grid && (kLaunch || !need_map)) {
         const auto& k = Op::template table<S>();
         parallel(in.num_samples(), in.grain(),
                  [&](int64_t begin, int64_t end) { k.backward_grid(in.args, data, begin, end); });

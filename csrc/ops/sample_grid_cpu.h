@@ -138,10 +138,6 @@ PRED_INLINE void dot_rows(const S* source, const S* const (&row)[Rows], int64_t 
   for (int r = 0; r < Rows; ++r) dots[r] += rest[r];
 }
 
-// Rows of gradients that one sample sends to its cells: that of the value, and with kRows = 1 + Axes those of the
-// value's derivatives, with kRows = kAlong that of its derivative along a direction.
-constexpr int kAlong = 2;
-
 template <int kRows, typename S, int Axes>
 PRED_INLINE void gradient_rows(const SampleGridArgs<S, Axes>& a, int64_t sample, const S* (&row)[kRows]) {
   row[0] = a.grad ? a.grad + sample * a.channels : a.zeros;
@@ -175,15 +171,9 @@ void forward_rows(const SampleGridArgs<S, Axes>& a, S* out, S* slopes, int64_t b
     const auto s = stencil(a, i);
     T weight[kOuts][1 << Axes];
     S* row[kOuts];
-    linear_weights(s, 0, weight[0]);
+    forward_weights<kOuts>(s, weight);
     row[0] = out + i * a.channels;
-    for (int m = 1; m < kOuts; ++m) {
-      linear_weights(s, 1 << (m - 1), weight[m]);
-      row[m] = slopes + (i * Axes + m - 1) * a.channels;
-      if (weight[0][0] != weight[0][0]) {  // slopes do not depend on every coordinate, but must show that one is NaN
-        for (T& w : weight[m]) w = weight[0][0];
-      }
-    }
+    for (int m = 1; m < kOuts; ++m) row[m] = slopes + (i * Axes + m - 1) * a.channels;
     blend(corners(a.map + i / a.num_samples * a.stride[Axes], a, s).row, weight, a.channels, row);
   }
 }
@@ -429,7 +419,8 @@ void double_backward(const SampleGridArgs<S, Axes>& a, S* grad_out, Compute<S>* 
 
 template <typename S, int Axes>
 constexpr SampleGridKernels<S, Axes> sample_grid_kernels() {
-  return {forward<S, Axes>, pack<S, Axes>, scatter_band<S, Axes>, backward_grid<S, Axes>, double_backward<S, Axes>};
+  return {forward<S, Axes>, pack<S, Axes>, scatter_band<S, Axes>, backward_grid<S, Axes>, double_backward<S, Axes>,
+          nullptr,          nullptr};
 }
 
 #undef PRED_INLINE

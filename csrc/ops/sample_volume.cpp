@@ -21,10 +21,10 @@ using SampleVolume = SampleGrid<Volume>;
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) {
-  m.impl("sample_volume", TORCH_BOX(&pred::SampleVolume::forward));
-  m.impl("sample_volume_backward", TORCH_BOX(&pred::SampleVolume::backward));
-  m.impl("sample_volume_double_backward", TORCH_BOX(&pred::SampleVolume::double_backward));
-  m.impl("sample_volume_with_grad", TORCH_BOX(&pred::SampleVolume::with_grad));
-  m.impl("sample_volume_with_grad_backward", TORCH_BOX(&pred::SampleVolume::with_grad_backward));
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) {
+  PRED_IMPL(m, "sample_volume", &pred::SampleVolume::forward);
+  PRED_IMPL(m, "sample_volume_backward", &pred::SampleVolume::backward);
+  PRED_IMPL(m, "sample_volume_double_backward", &pred::SampleVolume::double_backward);
+  PRED_IMPL(m, "sample_volume_with_grad", &pred::SampleVolume::with_grad);
+  PRED_IMPL(m, "sample_volume_with_grad_backward", &pred::SampleVolume::with_grad_backward);
 }

@@ -37,7 +37,8 @@ struct Rays {
        const std::optional<Tensor>& ray_offsets) {
     check_tensor(op, "sdf", sdf_in, ray_offsets ? 1 : 2, sdf_in.scalar_type());
     sdf = torch::stable::contiguous(sdf_in);
-    args = {{nullptr, 0, sdf.size(0)}, sdf.const_data_ptr<T>(), sharpness<T>(op, inv_s, sdf.scalar_type()), last_opaque};
+    args = {
+        {nullptr, 0, sdf.size(0)}, sdf.const_data_ptr<T>(), sharpness<T>(op, inv_s, sdf.scalar_type()), last_opaque};
     num_rays = sdf.size(0);
     if (ray_offsets) {
       offsets = read_offsets(op, "ray_offsets", *ray_offsets, 'P', sdf.size(0));
@@ -150,7 +151,8 @@ struct Sections {
             cosine.const_data_ptr<T>(),
             length.const_data_ptr<T>(),
             sharpness<T>("sdf_to_alpha", inv_s, sdf.scalar_type()),  // as the public op calls itself
-            cos_anneal.const_data_ptr<T>(), T(eps)};
+            cos_anneal.const_data_ptr<T>(),
+            T(eps)};
   }
 };
 

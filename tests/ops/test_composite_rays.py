@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pred.ops import Composite, composite_rays, reference
+from tests.conftest import require_value_checks
 from tests.ops.two_samples import TWO_SAMPLES, sigmoid
 from tests.tolerances import FORWARD, GRADIENT, assert_close, of_rounded_distances
 
@@ -357,6 +358,7 @@ def test_empty(backend: str, shape: tuple[int, int], channels: int) -> None:
 
 @pytest.mark.parametrize("wrong", [-1.0, torch.inf, torch.nan])
 def test_sharpness_is_checked(backend: str, wrong: float) -> None:
+    require_value_checks(backend)
     sdf, _, t, values = case()
     with pytest.raises(ValueError, match="composite_rays: inv_s must be finite and not negative, got -?(1|inf|nan)"):
         composite_rays(sdf, torch.tensor(wrong, dtype=torch.float64), t, values)

@@ -1,0 +1,531 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// CUDA kernels of sample_bev and sample_volume, which instantiate sample_grid_kernels<S, Axes>.
+//
+// Gathers: a group of lanes, as many as a row of channels has pieces of 16 bytes (1 to 32), owns one sample, a lane its
+// share of the channels.
+// Scatter: samples are sorted by their lower corner's cell, so that those of one cell stand side by side. A warp owns
+// one cell of the map and adds up what up to 4 (8) of these runs send to it, in their order: no two threads write one
+// address, and the sums have the same bits every time. Rays start in one place, so runs can be long there: pieces of
+// kPiece items, at multiples of it, that lie within one run are added up beforehand, each by a warp of its own.
+#pragma once
+
+#include "common/bits.h"
+#include "common/sort.h"
+#include "common/warp.cuh"
+#include "ops/sample_grid.h"
+
+namespace pred::PRED_ISA {
+namespace {
+
+// Neighbouring channels that one access moves.
+template <typename S, int V>
+struct alignas(V * sizeof(S)) Pack {
+  S x[V];
+};
+
+// value[v] = from[v], or 0 where there is none.
+template <int V, typename S>
+PRED_DEVICE_ONLY void load_pack(const S* from, Compute<S> (&value)[V]) {
+  Pack<S, V> pack;
+  if (from) pack = *reinterpret_cast<const Pack<S, V>*>(from);
+#pragma unroll
+  for (int v = 0; v < V; ++v) value[v] = from ? widen(pack.x[v]) : Compute<S>(0);
+}
+
+template <int V, typename S>
+PRED_DEVICE_ONLY void store_pack(S* to, const Compute<S> (&value)[V]) {
+  Pack<S, V> pack;
+#pragma unroll
+  for (int v = 0; v < V; ++v) pack.x[v] = narrow<S>(value[v]);
+  *reinterpret_cast<Pack<S, V>*>(to) = pack;
+}
+
+// Lanes that share one sample, a power of 2.
+struct Group {
+  int size, lane;
+
+  __device__ explicit Group(int lanes) : size(lanes), lane(lane_number() % lanes) {}
+  // Samples are numbered so that the groups of a warp have neighbouring ones.
+  __device__ int64_t first() const { return first_thread() / size; }
+  __device__ int64_t stride() const { return thread_stride() / size; }
+};
+
+PRED_DEVICE_ONLY int64_t divide(int64_t a, int64_t b) {
+  return ((a | b) >> 32) == 0 ? int64_t(uint32_t(a) / uint32_t(b)) : a / b;  // the latter takes some 100 instructions
+}
+
+template <typename S, int Axes>
+PRED_DEVICE_ONLY LinearStencil<Compute<S>, Axes> stencil(const SampleGridArgs<S, Axes>& a, int64_t sample) {
+  return linear_stencil<Axes>(a.grid + sample * Axes, a.size, a.border, a.align_corners);
+}
+
+// The rows of the map between which a sample lies; null outside of it.
+template <typename S, int Axes>
+struct Corners {
+  const S* row[1 << Axes];
+  bool any;
+
+  __device__ Corners(const S* map, const SampleGridArgs<S, Axes>& a, const LinearStencil<Compute<S>, Axes>& s) {
+    any = false;
+#pragma unroll
+    for (int k = 0; k < 1 << Axes; ++k) {
+      int64_t offset = 0;
+      for (int axis = 0; axis < Axes; ++axis) offset += (s.axis[axis].low + (k >> axis & 1)) * a.stride[axis];
+      const bool inside = linear_inside(s, k);
+      row[k] = inside ? map + offset : nullptr;
+      any = any || inside;
+    }
+  }
+};
+
+// The row of gradients that a sample sends to its cells: m = 0, that of the value; others, those of the value's
+// derivatives; with kRows = kAlong that of its derivative along a direction. Null where there is none.
+template <int kRows, typename S, int Axes>
+PRED_DEVICE_ONLY const S* gradient_row(const SampleGridArgs<S, Axes>& a, int64_t sample, int m) {
+  if (m == 0) return a.grad ? a.grad + sample * a.channels : nullptr;
+  if (kRows == kAlong) return a.grad_along + sample * a.channels;
+  return a.grad_slopes + (sample * Axes + m - 1) * a.channels;
+}
+
+template <int kOuts, int V, typename S, int Axes>
+__global__ void __launch_bounds__(kThreads)
+    forward_kernel(SampleGridArgs<S, Axes> a, S* out, S* slopes, int64_t num_samples, int lanes) {
+  using T = Compute<S>;
+  const Group group(lanes);
+  for (int64_t sample = group.first(); sample < num_samples; sample += group.stride()) {
+    const auto s = stencil(a, sample);
+    T weight[kOuts][1 << Axes];
+    forward_weights<kOuts>(s, weight);
+    const Corners<S, Axes> p(a.map + divide(sample, a.num_samples) * a.stride[Axes], a, s);
+    for (int64_t c = group.lane * V; c < a.channels; c += group.size * V) {
+      T sum[kOuts][V] = {};
+#pragma unroll
+      for (int k = 0; k < 1 << Axes; ++k) {
+        T value[V];
+        load_pack<V>(p.row[k] ? p.row[k] + c : nullptr, value);
+#pragma unroll
+        for (int m = 0; m < kOuts; ++m) {
+          for (int v = 0; v < V; ++v) sum[m][v] += value[v] * weight[m][k];
+        }
+      }
+      store_pack<V>(out + sample * a.channels + c, sum[0]);
+#pragma unroll
+      for (int m = 1; m < kOuts; ++m) store_pack<V>(slopes + (sample * Axes + m - 1) * a.channels + c, sum[m]);
+    }
+  }
+}
+
+// dots[k] += sum over the lane's channels of source[c] row_k[c]
+template <int V, int kCorners, typename S>
+PRED_DEVICE_ONLY void add_dots(const Group& group, const S* source, const S* const (&row)[kCorners], int64_t channels,
+                               Compute<S> (&dots)[kCorners]) {
+  if (!source) return;
+  for (int64_t c = group.lane * V; c < channels; c += group.size * V) {
+    Compute<S> from[V];
+    load_pack<V>(source + c, from);
+#pragma unroll
+    for (int k = 0; k < kCorners; ++k) {
+      Compute<S> value[V];
+      load_pack<V>(row[k] ? row[k] + c : nullptr, value);
+      for (int v = 0; v < V; ++v) dots[k] += from[v] * value[v];
+    }
+  }
+}
+
+template <int kRows, int V, typename S, int Axes>
+__global__ void __launch_bounds__(kThreads)
+    backward_grid_kernel(SampleGridArgs<S, Axes> a, Compute<S>* grad_grid, int64_t num_samples, int lanes) {
+  using T = Compute<S>;
+  const Group group(lanes);
+  // All lanes of a warp go on together, for the sums over groups.
+  for (int64_t sample = group.first(); __any_sync(kWholeWarp, sample < num_samples); sample += group.stride()) {
+    T gradient[Axes] = {};
+    if (sample < num_samples) {
+      const auto s = stencil(a, sample);
+      const Corners<S, Axes> p(a.map + divide(sample, a.num_samples) * a.stride[Axes], a, s);
+      for (int m = 0; p.any && m < kRows; ++m) {
+        T dots[1 << Axes] = {};
+        add_dots<V>(group, gradient_row<kRows>(a, sample, m), p.row, a.channels, dots);
+#pragma unroll
+        for (int axis = 0; axis < Axes; ++axis) {
+          if (m == 0) gradient[axis] += linear_interpolate(s, 1 << axis, dots);
+          if (m > 0 && m - 1 != axis) gradient[axis] += linear_interpolate(s, 1 << axis | 1 << (m - 1), dots);
+        }
+      }
+    }
+#pragma unroll
+    for (int axis = 0; axis < Axes; ++axis) {
+      const T sum = sum_lanes(gradient[axis], group.size);
+      if (group.lane == 0 && sample < num_samples) grad_grid[sample * Axes + axis] = sum;
+    }
+  }
+}
+
+template <int V, typename S, int Axes>
+__global__ void __launch_bounds__(kThreads)
+    double_backward_kernel(SampleGridArgs<S, Axes> a, S* grad_out, Compute<S>* grad_grid, int64_t num_samples,
+                           int lanes) {
+  using T = Compute<S>;
+  constexpr int kCorners = 1 << Axes;
+  const Group group(lanes);
+  for (int64_t sample = group.first(); __any_sync(kWholeWarp, sample < num_samples); sample += group.stride()) {
+    T gradient[Axes] = {};
+    if (sample < num_samples) {
+      const auto s = stencil(a, sample);
+      const int64_t offset = divide(sample, a.num_samples) * a.stride[Axes];
+      T direction[Axes] = {};
+      for (int axis = 0; a.grad_grad_grid && axis < Axes; ++axis) {
+        direction[axis] = a.grad_grad_grid[sample * Axes + axis];
+      }
+      const Corners<S, Axes> p(a.map + offset, a, s);
+      const Corners<S, Axes> u((a.grad_grad_map ? a.grad_grad_map : a.map) + offset, a, s);
+      if (grad_out) {
+        T along[kCorners], weight[kCorners];
+        linear_directional(s, direction, along);
+        linear_weights(s, 0, weight);
+        for (int64_t c = group.lane * V; c < a.channels; c += group.size * V) {
+          T sum[V] = {}, value[V];
+#pragma unroll
+          for (int k = 0; k < kCorners; ++k) {
+            load_pack<V>(p.row[k] ? p.row[k] + c : nullptr, value);
+            for (int v = 0; v < V; ++v) sum[v] += value[v] * along[k];
+            if (!a.grad_grad_map) continue;
+            load_pack<V>(u.row[k] ? u.row[k] + c : nullptr, value);
+            for (int v = 0; v < V; ++v) sum[v] += value[v] * weight[k];
+          }
+          store_pack<V>(grad_out + sample * a.channels + c, sum);
+        }
+      }
+      const S* grad = a.grad + sample * a.channels;
+      if (grad_grid && p.any && a.grad_grad_map) {
+        T dots[kCorners] = {};
+        add_dots<V>(group, grad, u.row, a.channels, dots);
+        for (int axis = 0; axis < Axes; ++axis) gradient[axis] = linear_interpolate(s, 1 << axis, dots);
+      }
+      if (grad_grid && p.any && a.grad_grad_grid) {
+        T dots[kCorners] = {};
+        add_dots<V>(group, grad, p.row, a.channels, dots);
+#pragma unroll
+        for (int axis = 1; axis < Axes; ++axis) {
+          for (int other = 0; other < axis; ++other) {
+            const T mixed = linear_interpolate(s, 1 << axis | 1 << other, dots);
+            gradient[axis] += mixed * direction[other];
+            gradient[other] += mixed * direction[axis];
+          }
+        }
+      }
+    }
+#pragma unroll
+    for (int axis = 0; axis < Axes; ++axis) {
+      const T sum = sum_lanes(gradient[axis], group.size);
+      if (grad_grid && group.lane == 0 && sample < num_samples) grad_grid[sample * Axes + axis] = sum;
+    }
+  }
+}
+
+// --- Scatter -------------------------------------------------------------------------------------
+constexpr int64_t kPiece = 64;
+
+// Lower corners: cells and those one below along each axis, in the order of maps, then z, y, x.
+template <int Axes>
+struct LowerCorners {
+  int64_t side[Axes];  // W + 1, H + 1(, D + 1)
+  int64_t count;
+  int number_bits, key_bits;  // of an item: the sample's number, and above it the key; `count` is that of no cell
+
+  template <typename S>
+  LowerCorners(const SampleGridArgs<S, Axes>& a, int64_t batch) {
+    count = batch;
+    for (int axis = 0; axis < Axes; ++axis) {
+      side[axis] = a.size[axis] + 1;
+      count *= side[axis];
+    }
+    number_bits = bits_for(batch * a.num_samples);
+    key_bits = bits_for(count + 1);
+  }
+
+  // Of the cell whose lower corner has coordinates `low`, from -1 on.
+  __device__ int64_t key(int64_t map, const int64_t (&low)[Axes]) const {
+    int64_t number = map;
+    for (int axis = Axes - 1; axis >= 0; --axis) number = number * side[axis] + low[axis] + 1;
+    return number;
+  }
+};
+
+// The parts of the workspace.
+template <typename S, int Axes>
+struct ScatterWorkspace {
+  uint64_t *items, *sorted;  // [N]
+  int64_t* start;            // [corners + 1], of each run
+  Compute<S>* pieces;        // [N / kPiece, 2^Axes, C], of which those within one run are filled
+  char* sort;
+  int64_t sort_bytes, bytes;
+
+  ScatterWorkspace(const SampleGridArgs<S, Axes>& a, const LowerCorners<Axes>& corners, int64_t batch, char* memory) {
+    const int64_t samples = batch * a.num_samples;
+    sort_bytes = pred::sort_bytes(samples, corners.number_bits, corners.number_bits + corners.key_bits);
+    char* at = memory;
+    const auto take = [&](int64_t size) {
+      char* part = at;
+      at += (size + 255) / 256 * 256;
+      return part;
+    };
+    items = reinterpret_cast<uint64_t*>(take(samples * 8));
+    sorted = reinterpret_cast<uint64_t*>(take(samples * 8));
+    start = reinterpret_cast<int64_t*>(take((corners.count + 1) * 8));
+    pieces = reinterpret_cast<Compute<S>*>(
+        take(samples / kPiece * (int64_t(1) << Axes) * a.channels * int64_t(sizeof(Compute<S>))));
+    sort = take(sort_bytes);
+    bytes = at - memory;
+  }
+};
+
+template <typename S, int Axes>
+__global__ void pack_kernel(SampleGridArgs<S, Axes> a, LowerCorners<Axes> corners, int64_t num_samples,
+                            uint64_t* items) {
+  for (int64_t sample = first_thread(); sample < num_samples; sample += thread_stride()) {
+    const auto s = stencil(a, sample);
+    int64_t low[Axes];
+    bool touches = true;
+    for (int axis = 0; axis < Axes; ++axis) {
+      low[axis] = s.axis[axis].low;
+      touches = touches && (s.axis[axis].low_inside || s.axis[axis].high_inside);
+    }
+    const int64_t key = touches ? corners.key(divide(sample, a.num_samples), low) : corners.count;
+    items[sample] = uint64_t(key) << corners.number_bits | uint64_t(sample);
+  }
+}
+
+// start[key] = the first item of this key or a higher one.
+static __global__ void start_kernel(const uint64_t* items, int64_t num_items, int number_bits, int64_t num_keys,
+                                    int64_t* start) {
+  for (int64_t key = first_thread(); key <= num_keys; key += thread_stride()) {
+    int64_t low = 0, high = num_items;
+    while (low < high) {
+      const int64_t middle = (low + high) / 2;
+      if (int64_t(items[middle] >> number_bits) < key)
+        low = middle + 1;
+      else
+        high = middle;
+    }
+    start[key] = low;
+  }
+}
+
+// The weights with which a sample's gradient rows are added to its cells.
+template <int kRows, typename S, int Axes>
+PRED_DEVICE_ONLY void scatter_weights(const SampleGridArgs<S, Axes>& a, int64_t sample, bool along_direction,
+                                      Compute<S> (&weight)[kRows][1 << Axes]) {
+  const auto s = stencil(a, sample);
+  if (along_direction) {
+    linear_directional(s, a.grad_grad_grid + sample * Axes, weight[0]);
+  } else {
+    linear_weights(s, 0, weight[0]);
+  }
+  if constexpr (kRows == kAlong) {
+    linear_directional(s, a.grad_grad_grid + sample * Axes, weight[1]);
+  } else {
+#pragma unroll
+    for (int m = 1; m < kRows; ++m) linear_weights(s, 1 << (m - 1), weight[m]);
+  }
+}
+
+// sum[k][v] += what the items [first, last) send to corner `from` + k, in channels c + v.
+template <int kRows, int kCells, int V, typename S, int Axes>
+PRED_DEVICE_ONLY void add_items(const SampleGridArgs<S, Axes>& a, const uint64_t* items, int number_bits,
+                                bool along_direction, int64_t first, int64_t last, int from, int64_t c,
+                                Compute<S> (&sum)[kCells][V]) {
+  using T = Compute<S>;
+  const uint64_t number_mask = (uint64_t(1) << number_bits) - 1;
+  for (int64_t turn = first; turn < last; turn += kWarp) {
+    const int64_t item = turn + lane_number();
+    int64_t own = 0;
+    T weight[kRows][1 << Axes] = {};
+    if (item < last) {
+      own = int64_t(items[item] & number_mask);
+      scatter_weights<kRows>(a, own, along_direction, weight);
+    }
+    T own_weight[kRows][kCells] = {};
+#pragma unroll
+    for (int m = 0; m < kRows; ++m) {
+#pragma unroll
+      for (int corner = 0; corner < 1 << Axes; ++corner) {  // registers are not indexed by `from`
+        for (int k = 0; k < kCells; ++k) {
+          if (corner == from + k) own_weight[m][k] = weight[m][corner];
+        }
+      }
+    }
+    const int count = last - turn < kWarp ? int(last - turn) : kWarp;
+    for (int i = 0; i < count; ++i) {
+      const int64_t sample = broadcast(own, i);
+#pragma unroll
+      for (int m = 0; m < kRows; ++m) {
+        T value[V];
+        const S* row = gradient_row<kRows>(a, sample, m);
+        load_pack<V>(row && c < a.channels ? row + c : nullptr, value);
+#pragma unroll
+        for (int k = 0; k < kCells; ++k) {
+          const T factor = broadcast(own_weight[m][k], i);
+          for (int v = 0; v < V; ++v) sum[k][v] += factor * value[v];
+        }
+      }
+    }
+  }
+}
+
+template <int kRows, int V, typename S, int Axes>
+__global__ void __launch_bounds__(kThreads)
+    piece_kernel(SampleGridArgs<S, Axes> a, LowerCorners<Axes> corners, ScatterWorkspace<S, Axes> space,
+                 bool along_direction, int64_t num_pieces) {
+  constexpr int kCorners = 1 << Axes;
+  for (int64_t piece = first_warp(); piece < num_pieces; piece += warp_stride()) {
+    const int64_t first = piece * kPiece, last = first + kPiece;
+    const int64_t key = int64_t(space.sorted[first] >> corners.number_bits);
+    if (key == corners.count || int64_t(space.sorted[last - 1] >> corners.number_bits) != key) continue;
+    for (int64_t c = lane_number() * V; c - lane_number() * V < a.channels; c += kWarp * V) {
+      Compute<S> sum[kCorners][V] = {};
+      add_items<kRows>(a, space.sorted, corners.number_bits, along_direction, first, last, 0, c, sum);
+      if (c >= a.channels) continue;
+#pragma unroll
+      for (int k = 0; k < kCorners; ++k) store_pack<V>(space.pieces + (piece * kCorners + k) * a.channels + c, sum[k]);
+    }
+  }
+}
+
+template <int kRows, int V, typename S, int Axes>
+__global__ void __launch_bounds__(kThreads)
+    cell_kernel(SampleGridArgs<S, Axes> a, LowerCorners<Axes> corners, ScatterWorkspace<S, Axes> space,
+                bool along_direction, int64_t num_cells, S* grad_map) {
+  using T = Compute<S>;
+  constexpr int kCorners = 1 << Axes;
+  for (int64_t cell = first_warp(); cell < num_cells; cell += warp_stride()) {
+    int64_t at[Axes], map = cell;
+    for (int axis = 0; axis < Axes; ++axis) {
+      const int64_t next = divide(map, a.size[axis]);
+      at[axis] = map - next * a.size[axis];
+      map = next;
+    }
+    for (int64_t c = lane_number() * V; c - lane_number() * V < a.channels; c += kWarp * V) {
+      T sum[1][V] = {};
+      for (int k = 0; k < kCorners; ++k) {
+        int64_t low[Axes];
+        for (int axis = 0; axis < Axes; ++axis) low[axis] = at[axis] - (k >> axis & 1);
+        const int64_t key = corners.key(map, low), first = space.start[key], last = space.start[key + 1];
+        int64_t whole = (first + kPiece - 1) / kPiece, whole_end = last / kPiece;
+        if (whole >= whole_end) whole = whole_end = (last + kPiece - 1) / kPiece + 1;  // behind them all: none
+        const int64_t head_end = whole * kPiece < last ? whole * kPiece : last;
+        add_items<kRows>(a, space.sorted, corners.number_bits, along_direction, first, head_end, k, c, sum);
+        for (int64_t piece = whole; piece < whole_end; ++piece) {
+          T value[V];
+          load_pack<V>(c < a.channels ? space.pieces + (piece * kCorners + k) * a.channels + c : nullptr, value);
+          for (int v = 0; v < V; ++v) sum[0][v] += value[v];
+        }
+        if (whole < whole_end) {
+          add_items<kRows>(a, space.sorted, corners.number_bits, along_direction, whole_end * kPiece, last, k, c, sum);
+        }
+      }
+      if (c < a.channels) store_pack<V>(grad_map + cell * a.channels + c, sum[0]);
+    }
+  }
+}
+
+// --- Launches ------------------------------------------------------------------------------------
+// Channels of an access: 16 bytes where rows allow it.
+template <typename S, class... Rows>
+bool in_packs(int64_t channels, const Rows*... rows) {
+  constexpr int64_t kBytes = 16;
+  return channels * int64_t(sizeof(S)) % kBytes == 0 && ((reinterpret_cast<uintptr_t>(rows) | ...) % kBytes) == 0;
+}
+
+template <typename S>
+constexpr int kPack = 16 / int(sizeof(S));
+
+inline int lanes_for(int64_t pieces) {
+  int lanes = 1;
+  while (lanes < kWarp && lanes < pieces) lanes *= 2;
+  return lanes;
+}
+
+// Calls body(std::integral_constant<int, V>, lanes of a group) with V channels to an access.
+template <typename S, class Body>
+void by_pack(bool packs, int64_t channels, const Body& body) {
+  if (packs) {
+    body(std::integral_constant<int, kPack<S>>(), lanes_for(channels / kPack<S>));
+  } else {
+    body(std::integral_constant<int, 1>(), lanes_for(channels));
+  }
+}
+
+template <typename S, int Axes>
+void forward(const SampleGridArgs<S, Axes>& a, S* out, S* slopes, int64_t, int64_t num_samples) {
+  by_pack<S>(in_packs<S>(a.channels, a.map, out, slopes), a.channels, [&](auto pack, int lanes) {
+    constexpr int V = decltype(pack)::value;
+    launch_threads(slopes ? forward_kernel<1 + Axes, V, S, Axes> : forward_kernel<1, V, S, Axes>, num_samples * lanes,
+                   a, out, slopes, num_samples, lanes);
+  });
+}
+
+template <typename S, int Axes>
+void backward_grid(const SampleGridArgs<S, Axes>& a, Compute<S>* grad_grid, int64_t, int64_t num_samples) {
+  by_pack<S>(in_packs<S>(a.channels, a.map, a.grad, a.grad_slopes), a.channels, [&](auto pack, int lanes) {
+    constexpr int V = decltype(pack)::value;
+    launch_threads(a.grad_slopes ? backward_grid_kernel<1 + Axes, V, S, Axes> : backward_grid_kernel<1, V, S, Axes>,
+                   num_samples * lanes, a, grad_grid, num_samples, lanes);
+  });
+}
+
+template <typename S, int Axes>
+void double_backward(const SampleGridArgs<S, Axes>& a, S* grad_out, Compute<S>* grad_grid, int64_t,
+                     int64_t num_samples) {
+  by_pack<S>(in_packs<S>(a.channels, a.map, a.grad, a.grad_grad_map, grad_out), a.channels, [&](auto pack, int lanes) {
+    constexpr int V = decltype(pack)::value;
+    launch_threads(double_backward_kernel<V, S, Axes>, num_samples * lanes, a, grad_out, grad_grid, num_samples, lanes);
+  });
+}
+
+template <typename S, int Axes>
+int64_t scatter_bytes(const SampleGridArgs<S, Axes>& a, int64_t batch) {
+  return ScatterWorkspace<S, Axes>(a, LowerCorners<Axes>(a, batch), batch, nullptr).bytes;
+}
+
+template <int kRows, typename S, int Axes>
+void scatter_rows(const SampleGridArgs<S, Axes>& a, int64_t batch, bool along_direction, S* grad_map,
+                  const LowerCorners<Axes>& corners, const ScatterWorkspace<S, Axes>& space) {
+  const int64_t num_samples = batch * a.num_samples, num_cells = batch * (a.stride[Axes] / a.channels);
+  by_pack<S>(in_packs<S>(a.channels, a.grad, a.grad_slopes, a.grad_along, grad_map), a.channels, [&](auto pack, int) {
+    constexpr int V = decltype(pack)::value;
+    launch_warps(piece_kernel<kRows, V, S, Axes>, num_samples / kPiece, a, corners, space, along_direction,
+                 num_samples / kPiece);
+    launch_warps(cell_kernel<kRows, V, S, Axes>, num_cells, a, corners, space, along_direction, num_cells, grad_map);
+  });
+}
+
+template <typename S, int Axes>
+void scatter(const SampleGridArgs<S, Axes>& a, int64_t batch, bool along_direction, S* grad_map, char* workspace) {
+  const LowerCorners<Axes> corners(a, batch);
+  const ScatterWorkspace<S, Axes> space(a, corners, batch, workspace);
+  const int64_t num_samples = batch * a.num_samples;
+  launch_threads(pack_kernel<S, Axes>, num_samples, a, corners, num_samples, space.items);
+  sort_items(space.sort, space.sort_bytes, space.items, space.sorted, num_samples, corners.number_bits,
+             corners.number_bits + corners.key_bits);
+  launch_threads(start_kernel, corners.count + 1, static_cast<const uint64_t*>(space.sorted), num_samples,
+                 corners.number_bits, corners.count, space.start);
+  if (a.grad_along) {
+    scatter_rows<kAlong>(a, batch, false, grad_map, corners, space);
+  } else if (a.grad_slopes) {
+    scatter_rows<1 + Axes>(a, batch, along_direction, grad_map, corners, space);
+  } else {
+    scatter_rows<1>(a, batch, along_direction, grad_map, corners, space);
+  }
+}
+
+template <typename S, int Axes>
+constexpr SampleGridKernels<S, Axes> sample_grid_kernels() {
+  return {forward<S, Axes>,       nullptr,         nullptr, backward_grid<S, Axes>, double_backward<S, Axes>,
+          scatter_bytes<S, Axes>, scatter<S, Axes>};
+}
+
+}  // namespace
+}  // namespace pred::PRED_ISA
