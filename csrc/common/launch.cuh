@@ -59,6 +59,16 @@ PRED_DEVICE_ONLY int64_t first_thread() { return int64_t(blockIdx.x) * blockDim.
 PRED_DEVICE_ONLY int64_t thread_stride() { return int64_t(gridDim.x) * blockDim.x; }
 PRED_DEVICE_ONLY int64_t first_warp() { return first_thread() / kWarp; }
 PRED_DEVICE_ONLY int64_t warp_stride() { return thread_stride() / kWarp; }
+// What launch_blocks was asked for.
+PRED_DEVICE_ONLY void* dynamic_shared() {
+#ifdef __CUDACC__
+  extern __shared__ __align__(16) unsigned char pred_dynamic_shared[];
+  return pred_dynamic_shared;
+#else
+  return emulation::dynamic_shared_memory();
+#endif
+}
+
 PRED_DEVICE_ONLY int lane_number() { return int(threadIdx.x % kWarp); }
 
 }  // namespace pred

@@ -15,17 +15,6 @@ constexpr int64_t kPad = 16;  // at least a vector, on both sides of every row
 
 static inline int64_t padded(int64_t n) { return (n + kPad - 1) / kPad * kPad; }
 
-template <typename T>
-struct Limits;
-template <>
-struct Limits<float> {
-  static constexpr float smallest = __FLT_MIN__, largest = __FLT_MAX__, below_one = 1.0f - __FLT_EPSILON__ / 2;
-};
-template <>
-struct Limits<double> {
-  static constexpr double smallest = __DBL_MIN__, largest = __DBL_MAX__, below_one = 1.0 - __DBL_EPSILON__ / 2;
-};
-
 // Scratch rows of one ray, with room for a vector on both sides. Sections are padded to whole vectors, by empty ones
 // at the end.
 template <typename T>
@@ -62,13 +51,6 @@ static Row<T> make_row(const SamplePdfArgs<T>& a, T* scratch, int32_t* int_scrat
           u + a.num_new + kPad,
           int_scratch,
           int_scratch + a.num_new};
-}
-
-// To [0, 1); keeps NaN.
-template <typename T>
-static inline T clip_position(T u) {
-  const T low = u < T(0) ? T(0) : u;
-  return low > Limits<T>::below_one ? Limits<T>::below_one : low;
 }
 
 template <typename T>
@@ -173,36 +155,21 @@ static __attribute__((noinline)) void exact_samples(bool has_cdf, int64_t num_ne
   const int32_t last = int32_t(row.sections) - 1;
   for (int64_t k = 0; k < num_new; ++k) {
     const int32_t before = above[k] - 1, positive = before > 0 ? before : 0, i = positive < last ? positive : last;
-    const T width = cdf[i + 1] - cdf[i];
-    const T fraction = (u[k] - cdf[i]) / (width > T(0) ? width : T(1));
-    samples[k] = has_cdf ? t[i] + fraction * (t[i + 1] - t[i]) : T(__builtin_nan(""));
+    const T x = exact_sample(u[k], cdf[i], cdf[i + 1], t[i], t[i + 1]);
+    samples[k] = has_cdf ? x : T(__builtin_nan(""));
   }
-}
-
-// 0 for NaN, and within [0, 1].
-template <typename T>
-static inline T clip_fraction(T x) {
-  const T low = x >= T(0) ? x : T(0);
-  return low > T(1) ? T(1) : low;
 }
 
 template <typename T>
 static inline void published_samples(const PdfRule<T>& rule, int64_t num_new, const Row<T>& row,
                                      T* __restrict samples) {
   search(num_new, row);
-  const bool neus = rule.mode == PdfMode::kNeus;
-  const T narrow = neus ? rule.eps : rule.min_width;
   const T* __restrict t = row.t, * __restrict cdf = row.cdf, * __restrict u = row.u;
   const int32_t* __restrict above = row.low;
   const int32_t last = int32_t(row.sections);
   for (int64_t k = 0; k < num_new; ++k) {
     const int32_t low = above[k] > 1 ? above[k] - 1 : 0, high = above[k] < last ? above[k] : last;
-    const T width = cdf[high] - cdf[low];
-    const T fraction = (u[k] - cdf[low]) / (narrow > T(0) && width < narrow ? T(1) : width);
-    const T clipped = clip_fraction(fraction);
-    // With a least width nothing is divided by 0, and NaN is that of the input.
-    const T kept = neus || (narrow > T(0) && fraction != fraction) ? fraction : clipped;
-    samples[k] = t[low] + kept * (t[high] - t[low]);
+    samples[k] = published_sample(rule, u[k], cdf[low], cdf[high], t[low], t[high]);
   }
 }
 

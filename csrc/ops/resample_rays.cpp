@@ -18,4 +18,4 @@ Tensor resample_rays(const Tensor& t, const Tensor& weights, const Tensor& u, co
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) { m.impl("resample_rays", TORCH_BOX(&pred::resample_rays)); }
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) { PRED_IMPL(m, "resample_rays", &pred::resample_rays); }

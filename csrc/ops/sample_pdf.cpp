@@ -18,4 +18,4 @@ Tensor sample_pdf(const Tensor& edges, const Tensor& weights, const Tensor& u, c
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) { m.impl("sample_pdf", TORCH_BOX(&pred::sample_pdf)); }
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) { PRED_IMPL(m, "sample_pdf", &pred::sample_pdf); }

@@ -58,6 +58,11 @@ Tensor sample_sections(const char* op, const char* name, bool merged, const Samp
   Tensor samples = torch::stable::new_empty(edges, {rays, merged ? num_edges + num_new : num_new});
   if (samples.numel() == 0) return samples;
   T* out = samples.mutable_data_ptr<T>();
+  if (kLaunch) {
+    const Tensor scratch = torch::stable::new_empty(edges, {k.scratch_size(a)});
+    k.sample(a, out, scratch.mutable_data_ptr<T>(), nullptr, 0, rays);
+    return samples;
+  }
   parallel(rays, 1 + 32768 / (num_edges + num_new), [&](int64_t begin, int64_t end) {
     std::vector<T> scratch(k.scratch_size(a));
     std::vector<int32_t> int_scratch(k.int_scratch_size(a));
