@@ -4,6 +4,9 @@
 #   make demo      set up, make a small world, pre-train a small model on it, draw pictures
 #   make test      set up, run all tests
 #   make sanitize  run the op tests under the address and undefined-behaviour sanitizers
+#   make emulate   the tests of ops with CUDA kernels, on those kernels run by the CPU under the sanitizers
+#   make cuda-compile  the CUDA library for all architectures, compiled and linked (needs nvcc, no GPU)
+#   make test-cuda the same tests on a GPU, then compute-sanitizer on some (uses $(PYTHON) and its torch)
 #   make fuzz      random arguments for every op under the sanitizers, for MINUTES
 #   make wheel-check  the op tests of one wheel under other versions of torch (downloads gigabytes)
 #   make lint      ruff, clang-format, mypy
@@ -29,7 +32,7 @@ NATIVE := $(shell find csrc -type f) CMakeLists.txt setup.py
 # What nuscenes-devkit imports when its tables, maps and geometry are used; its numpy<2 pin is left aside.
 DEVKIT := cachetools descartes matplotlib opencv-python-headless pyquaternion scikit-learn shapely tqdm
 
-.PHONY: demo test sanitized sanitize fuzz wheel-check lint format docs bench clean
+.PHONY: demo test sanitized sanitize emulate cuda-compile test-cuda fuzz wheel-check lint format docs bench clean
 .DELETE_ON_ERROR:
 
 $(VENV)/torch-$(TORCH).stamp:
@@ -74,6 +77,34 @@ sanitized: $(VENV)/dev.stamp
 sanitize: sanitized
 	PYTHONPATH=$(SANITIZE) $(SANITIZED) $(BIN)/python -m pytest -p no:cacheprovider -o pythonpath="$(SANITIZE) ." \
 		tests/ops tests/test_native.py tests/data/test_sweeps.py
+
+# CUDA kernels on the CPU, in a copy of the package; csrc/emulation/cuda.h says how. ORDER is that of a block's threads.
+EMULATED := $(CURDIR)/build/emulated
+ORDER ?= shuffled
+CUDA_OPS := composite_alpha composite_rays resample_rays sample_pdf sdf_to_alpha
+CUDA_TESTS := $(CUDA_OPS:%=tests/ops/test_%.py) tests/ops/test_composites.py tests/ops/test_sampling.py tests/test_emulation.py
+emulate: $(VENV)/dev.stamp
+	rm -rf $(EMULATED)
+	PRED_CUDA=emulate PRED_SANITIZE=address,undefined PRED_REQUIRE_NATIVE=1 \
+		$(PIP) install --no-deps --no-build-isolation --target $(EMULATED) .
+	PYTHONPATH=$(EMULATED) PRED_EMULATION_ORDER=$(ORDER) $(SANITIZED) $(BIN)/python -m pytest -p no:cacheprovider \
+		-o pythonpath="$(EMULATED) ." $(CUDA_TESTS)
+
+cuda-compile: $(VENV)/dev.stamp
+	$(BIN)/cmake -G Ninja -S . -B build/cuda -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN))/ninja -DPRED_CUDA=ON -DPRED_HOST=OFF \
+		-DPRED_TORCH_DIR=$$($(BIN)/python -c "import pathlib, torch; print(pathlib.Path(torch.__file__).parent)")
+	$(BIN)/cmake --build build/cuda --target pred_cuda
+	PRED_TEST_CUDA_LIBRARY=build/cuda/libpred_cuda.so $(BIN)/python -m pytest tests/test_cuda_library.py
+
+# Builds in place, for the GPUs that are there. CPU tensors of the tests go through the GPU: tests/conftest.py.
+test-cuda:
+	PRED_CUDA=1 PRED_REQUIRE_NATIVE=1 CUDAARCHS=native $(PYTHON) setup.py -q build_ext --inplace
+	PRED_REQUIRE_NATIVE=1 $(PYTHON) -m pytest -q tests/test_cuda.py
+	PRED_TEST_DEVICE=cuda PRED_REQUIRE_NATIVE=1 $(PYTHON) -m pytest -q $(CUDA_TESTS)
+	for tool in memcheck racecheck; do \
+		compute-sanitizer --tool $$tool --error-exitcode 1 --target-processes all \
+			$(PYTHON) -m pytest -q tests/test_cuda.py -k parity || exit 1; \
+	done
 
 # From another folder, since python -m puts the working one, with its pred/, first on the path.
 fuzz: sanitized

@@ -92,7 +92,8 @@ def _machine() -> list[tuple[str, str]]:
     if torch.cuda.is_available():
         names = {torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())}
         lines.append(("cuda", f"{torch.cuda.device_count()} device(s): {', '.join(sorted(names))}"))
-        lines.append(("cuda kernels", "none yet: CUDA tensors use the PyTorch reference"))
+        missing = native_status()["cuda_reason"]
+        lines.append(("cuda kernels", f"none: {missing}; CUDA tensors use the references" if missing else "loaded"))
     elif torch.version.cuda is None:
         lines.append(("cuda", "not available: this torch is built without CUDA"))
     else:

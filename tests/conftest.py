@@ -6,22 +6,28 @@ state_dicts/<model>.txt (names, shapes and types of the tensors of OpenPCDet's a
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import re
 import shutil
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from torch.utils._pytree import tree_map_only
 
 from pred import _native
 
 EMULATED = bool(_native.native_status()["emulated"])
 """The compiled ops are the CUDA kernels, which run on the CPU (``make emulate``)."""
-LEVELS = ("default",) if EMULATED else ("default", "avx2", "avx512", "avx512_bf16")
+DEVICE = os.environ.get("PRED_TEST_DEVICE", "cpu")
+"""Where compiled ops run; with ``cuda``, CPU tensors too (`_redirect`)."""
+LAUNCHED = EMULATED or DEVICE != "cpu"
+LEVELS = ("default",) if LAUNCHED else ("default", "avx2", "avx512", "avx512_bf16")
 SANITIZED = os.environ.get("PRED_TEST_SANITIZED") == "1"
 """The run is to find memory errors in the compiled code; tests of a reference alone are left out."""
 
@@ -32,6 +38,27 @@ KERNEL_ERROR = (ValueError, RuntimeError)
 def pytest_configure(config: pytest.Config) -> None:
     if SANITIZED and not _native.native_status()["build"].get("sanitizers"):
         raise pytest.UsageError(f"{_native.native_status()['path']} was not built with sanitizers")
+
+
+def _redirect() -> torch.library.Library:
+    """Takes CPU tensors of compiled ops to the device and their results back, so that every test of an op tests the
+    device's kernels. As long as the library that is returned lives."""
+    library = torch.library.Library("pred", "IMPL")
+    for full_name in torch._C._dispatch_get_all_op_names():
+        namespace, _, name = full_name.partition("::")
+        if namespace == "pred" and torch._C._dispatch_has_kernel_for_dispatch_key(full_name, DEVICE.upper()):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that it overrides the CPU's kernel
+                library.impl(name, functools.partial(_on_device, getattr(torch.ops.pred, name).default), "CPU")
+    return library
+
+
+def _on_device(op: Callable[..., Any], *arguments: Any) -> Any:
+    results = op(*tree_map_only(torch.Tensor, lambda tensor: tensor.to(DEVICE), arguments))
+    return tree_map_only(torch.Tensor, lambda tensor: tensor.cpu(), results)
+
+
+_REDIRECTED = _redirect() if DEVICE != "cpu" else None
 
 
 @pytest.fixture(autouse=True)
@@ -71,7 +98,7 @@ def level(request: pytest.FixtureRequest, native: None, monkeypatch: pytest.Monk
 
 def require_value_checks(backend: str) -> None:
     """Kernels that are launched check no values: that would make the host wait for the device."""
-    if EMULATED and backend == "native":
+    if LAUNCHED and backend == "native":
         pytest.skip("kernels that are launched check no values")
 
 
