@@ -95,7 +95,8 @@ PRED_DEVICE_ONLY void published_distribution(const PdfRule<T>& rule, const T* we
   }
   __syncwarp();
   accumulate(row.mass, sections, row.cdf);
-  for (int64_t i = lane_number(); !neus && i <= sections; i += kWarp) row.cdf[i] = row.cdf[i] > T(1) ? T(1) : row.cdf[i];
+  for (int64_t i = lane_number(); !neus && i <= sections; i += kWarp)
+    row.cdf[i] = row.cdf[i] > T(1) ? T(1) : row.cdf[i];
   __syncwarp();
 }
 
@@ -155,18 +156,18 @@ PRED_DEVICE_ONLY int64_t rank(const T* x, int64_t n, T value, int64_t own) {
 template <typename T>
 PRED_DEVICE_ONLY void merge(const SamplePdfArgs<T>& a, const Row<T>& row, T* merged) {
   const int64_t old = a.num_edges, added = a.num_new;
-  const bool in_order = ascending(row.t, old) && ascending(row.added, added) &&
-                        row.t[old - 1] == row.t[old - 1] && (added == 0 || row.added[0] == row.added[0]);
+  const bool in_order = ascending(row.t, old) && ascending(row.added, added) && row.t[old - 1] == row.t[old - 1] &&
+                        (added == 0 || row.added[0] == row.added[0]);
   for (int64_t i = lane_number(); i < old; i += kWarp) {
     const T x = row.t[i];
-    const int64_t place = in_order ? i + count_before<false>(row.added, added, x)
-                                   : rank(row.t, old, x, i) + rank(row.added, added, x, 0);
+    const int64_t place =
+        in_order ? i + count_before<false>(row.added, added, x) : rank(row.t, old, x, i) + rank(row.added, added, x, 0);
     merged[place] = x;
   }
   for (int64_t k = lane_number(); k < added; k += kWarp) {
     const T x = row.added[k];
-    const int64_t place = in_order ? k + count_before<true>(row.t, old, x)
-                                   : rank(row.t, old, x, old) + rank(row.added, added, x, k);
+    const int64_t place =
+        in_order ? k + count_before<true>(row.t, old, x) : rank(row.t, old, x, old) + rank(row.added, added, x, k);
     merged[place] = x;
   }
 }
