@@ -16,16 +16,26 @@ struct ProjectArgs {
   int64_t inputs, outputs;  // C, h
   const S* rows;            // [cells, C]
   const S* grad;            // [cells, h], of the backward pass
-  const S* packed;          // W^T forward, W backward
+  const S* packed;          // W^T forward, W backward; not where kernels are launched
 };
 
-// Gradients; null where not wanted. The weight's, [h, columns(C)], is added to.
+// Gradients; null where not wanted. The weight's, [h, columns(C)], is added to; launched, [h, C] is written.
 template <typename S>
 struct ProjectGradients {
   S* rows;
   Compute<S>* weight;
 };
 
+#ifdef PRED_LAUNCH
+template <typename S>
+struct ProjectKernels {
+  using T = Compute<S>;
+  int64_t (*workspace_bytes)(const ProjectArgs<S>&, int64_t cells);
+  // weight: [h, C].
+  void (*forward)(const ProjectArgs<S>&, const T* weight, S* out, char* workspace, int64_t cells);
+  void (*backward)(const ProjectArgs<S>&, const T* weight, const ProjectGradients<S>&, char* workspace, int64_t cells);
+};
+#else
 template <typename S>
 struct ProjectKernels {
   using T = Compute<S>;
@@ -37,6 +47,7 @@ struct ProjectKernels {
   void (*forward)(const ProjectArgs<S>&, S* out, char* scratch, int64_t begin, int64_t end);
   void (*backward)(const ProjectArgs<S>&, const ProjectGradients<S>&, char* scratch, int64_t begin, int64_t end);
 };
+#endif
 
 }  // namespace pred
 

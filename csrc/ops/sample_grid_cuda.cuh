@@ -14,6 +14,7 @@
 #include "common/bits.h"
 #include "common/sort.h"
 #include "common/warp.cuh"
+#include "common/workspace.h"
 #include "ops/sample_grid.h"
 
 namespace pred::PRED_ISA {
@@ -266,19 +267,13 @@ struct ScatterWorkspace {
   ScatterWorkspace(const SampleGridArgs<S, Axes>& a, const LowerCorners<Axes>& corners, int64_t batch, char* memory) {
     const int64_t samples = batch * a.num_samples;
     sort_bytes = pred::sort_bytes(samples, corners.number_bits, corners.number_bits + corners.key_bits);
-    char* at = memory;
-    const auto take = [&](int64_t size) {
-      char* part = at;
-      at += (size + 255) / 256 * 256;
-      return part;
-    };
-    items = reinterpret_cast<uint64_t*>(take(samples * 8));
-    sorted = reinterpret_cast<uint64_t*>(take(samples * 8));
-    start = reinterpret_cast<int64_t*>(take((corners.count + 1) * 8));
-    pieces = reinterpret_cast<Compute<S>*>(
-        take(samples / kPiece * (int64_t(1) << Axes) * a.channels * int64_t(sizeof(Compute<S>))));
-    sort = take(sort_bytes);
-    bytes = at - memory;
+    Workspace space(memory);
+    items = space.take<uint64_t>(samples);
+    sorted = space.take<uint64_t>(samples);
+    start = space.take<int64_t>(corners.count + 1);
+    pieces = space.take<Compute<S>>(samples / kPiece * (int64_t(1) << Axes) * a.channels);
+    sort = space.take<char>(sort_bytes);
+    bytes = space.bytes();
   }
 };
 
