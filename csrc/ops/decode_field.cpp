@@ -31,7 +31,7 @@ struct Field {
   std::unique_ptr<S[]> zeros;
   std::unique_ptr<char[]> packed;
   std::vector<std::vector<T>> padded;  // biases and the row of the distance
-  std::vector<T> grid;                 // [B N, 2], made where wanted
+  Tensor grid;                         // [B N, 2], made where wanted
   int64_t batch, num_samples, stride;
   FieldArgs<S> args{};
 
@@ -73,10 +73,16 @@ struct Field {
     args.sdf_scale = positive("sdf_scale", sdf_scale);
     args.num_hidden = layers - 1;
     args.num_outputs = widths[layers];
-    pack_parameters();
+    if constexpr (!kLaunch) pack_parameters();
   }
 
   int64_t columns(int64_t layer) const { return decode_field_kernels<S>().columns(widths[layer]); }
+
+  // Of kernels that are launched.
+  Tensor workspace(bool backward) const {
+    const int64_t bytes = decode_field_kernels<S>().workspace_bytes(args, num_samples, backward);
+    return torch::stable::new_empty(map, {bytes}, ScalarType::Byte);
+  }
 
   // Nothing kept has no rows either: torch cannot copy some shapes of no elements.
   std::vector<int64_t> saved_shape(int64_t layers) const {
@@ -85,15 +91,20 @@ struct Field {
 
   // Positions in the map, as sample_bev takes them.
   void make_grid() {
-    grid.resize(2 * num_samples);
-    parallel(num_samples, 16384, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) {
-        for (int axis = 0; axis < 2; ++axis) {
-          grid[2 * i + axis] = (args.points[3 * i + axis] - args.centre[axis]) / args.half_extent[axis];
+    grid = torch::stable::new_empty(points, {2 * num_samples});
+    T* to = grid.template mutable_data_ptr<T>();
+    if constexpr (kLaunch) {
+      decode_field_kernels<S>().positions(args, to, num_samples);
+    } else {
+      parallel(num_samples, 16384, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; ++i) {
+          for (int axis = 0; axis < 2; ++axis) {
+            to[2 * i + axis] = (args.points[3 * i + axis] - args.centre[axis]) / args.half_extent[axis];
+          }
         }
-      }
-    });
-    args.map.grid = grid.data();
+      });
+    }
+    args.map.grid = to;
   }
 
  private:
@@ -122,6 +133,7 @@ struct Field {
       PRED_CHECK(m.size[axis] >= 1, op, ": projected must have at least one cell along each axis, got ",
                  shape_text(map));
     }
+    if (kLaunch) return;
     zeros = allocate_zeros<S>(m.channels);
     m.zeros = zeros.get();
   }
@@ -191,6 +203,22 @@ struct Field {
 
 using Outputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
 
+template <typename S>
+void forward(const Field<S>& in, const FieldSaved<S>& saved, const FieldOutputs<S>& out) {
+  const FieldKernels<S>& k = decode_field_kernels<S>();
+  if constexpr (kLaunch) {
+    const Tensor workspace = in.workspace(false);
+    k.forward(in.args, in.parameters.template const_data_ptr<Compute<S>>(), saved, out,
+              mutable_storage<char>(workspace), in.num_samples);
+  } else {
+    const Blocks tasks = product_tasks(in.num_samples);
+    parallel(tasks.count(), 1, [&](int64_t first, int64_t last) {
+      const auto scratch = allocate_array<char>(k.scratch_bytes(in.args, false));
+      k.forward(in.args, saved, out, scratch.get(), tasks.begin(first), tasks.end(last - 1), in.num_samples);
+    });
+  }
+}
+
 Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor& parameters,
                      std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
                      double sdf_scale, bool with_gradient, bool keep) {
@@ -203,22 +231,67 @@ Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor
     const int64_t layers = in.args.num_hidden;
     const auto kept = [&](int64_t rows) {
       Tensor tensor = torch::stable::new_empty(in.map, in.saved_shape(keep ? rows : 0));
-      prefer_large_pages(tensor.mutable_data_ptr(), tensor.numel() * int64_t(sizeof(S)));
+      if (!kLaunch) prefer_large_pages(tensor.mutable_data_ptr(), tensor.numel() * int64_t(sizeof(S)));
       return tensor;
     };
     Tensor activation = kept(layers), chain = kept(with_gradient ? layers - 1 : 0);
     const FieldSaved<S> saved{keep ? mutable_storage<S>(activation) : nullptr,
                               keep && with_gradient ? mutable_storage<S>(chain) : nullptr};
-    const FieldOutputs<S> out{sdf.mutable_data_ptr<T>(), semantics.mutable_data_ptr<T>(),
-                              with_gradient ? gradient.mutable_data_ptr<T>() : nullptr};
-    const FieldKernels<S>& k = decode_field_kernels<S>();
-    const Blocks tasks = product_tasks(in.num_samples);
-    parallel(tasks.count(), 1, [&](int64_t first, int64_t last) {
-      const auto scratch = allocate_array<char>(k.scratch_bytes(in.args, false));
-      k.forward(in.args, saved, out, scratch.get(), tasks.begin(first), tasks.end(last - 1), in.num_samples);
-    });
+    forward<S>(in, saved,
+               {sdf.mutable_data_ptr<T>(), semantics.mutable_data_ptr<T>(),
+                with_gradient ? gradient.mutable_data_ptr<T>() : nullptr});
     return Outputs(sdf, semantics, gradient, activation, chain);
   });
+}
+
+// What becomes of the gradient of the map, [B N, width] and [B N, 2]; without elements where it is not wanted.
+struct AlongMap {
+  Tensor rows, slopes, directions;
+};
+
+// Gradients of the points and of the parameters; null where not wanted.
+template <typename S, typename T = Compute<S>>
+void backward(const Field<S>& in, const FieldSaved<S>& saved, const FieldCotangents<S>& grad, const AlongMap& along,
+              T* grad_points, T* grad_parameters) {
+  const FieldKernels<S>& k = decode_field_kernels<S>();
+  const auto pointer = [](const Tensor& tensor, auto type) {
+    return tensor.numel() > 0 ? mutable_storage<decltype(type)>(tensor) : nullptr;
+  };
+  FieldGradients<S> out{grad_parameters, pointer(along.rows, S()), pointer(along.slopes, S()),
+                        pointer(along.directions, T()), grad_points};
+  if constexpr (kLaunch) {
+    const Tensor workspace = in.workspace(true);
+    k.backward(in.args, in.parameters.template const_data_ptr<T>(), saved, grad, out, mutable_storage<char>(workspace),
+               in.num_samples);
+  } else {
+    // Each block's sums: dW [outputs, columns] and db of one layer after the other.
+    const int64_t layers = in.args.num_hidden + 1;
+    int64_t block_sums = 0;
+    for (int64_t l = 0; l < layers; ++l) block_sums += in.widths[l + 1] * (in.columns(l) + 1);
+    const Blocks blocks = product_sums(in.num_samples, block_sums * int64_t(sizeof(T)));
+    std::unique_ptr<T[]> sums;
+    if (grad_parameters) sums = allocate_array<T>(blocks.count() * block_sums);
+    parallel(blocks.count(), 1, [&](int64_t first, int64_t last) {
+      const auto scratch = allocate_array<char>(k.scratch_bytes(in.args, true));
+      for (int64_t block = first; block < last; ++block) {
+        FieldGradients<S> block_out = out;
+        block_out.parameters = sums ? sums.get() + block * block_sums : nullptr;
+        if (sums) std::fill(block_out.parameters, block_out.parameters + block_sums, T(0));
+        k.backward(in.args, saved, grad, block_out, scratch.get(), blocks.begin(block), blocks.end(block),
+                   in.num_samples);
+      }
+    });
+    const T* from = sums.get();
+    for (int64_t l = 0; grad_parameters && l < layers; ++l) {
+      const int64_t outputs = in.widths[l + 1], inputs = in.widths[l], columns = in.columns(l);
+      add_blocks(from, blocks.count(), block_sums, outputs, columns, inputs, grad_parameters);
+      from += outputs * columns;
+      grad_parameters += outputs * inputs;
+      add_blocks(from, blocks.count(), block_sums, 1, 0, outputs, grad_parameters);
+      from += outputs;
+      grad_parameters += outputs;
+    }
+  }
 }
 
 std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
@@ -253,53 +326,21 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
                               saved_rows("chain", chain, in.args.num_hidden - 1)};
     PRED_CHECK(saved.activation || !saved.chain, op, ": activation must be given with chain, got none");
 
-    const int64_t width = in.args.map.channels, layers = in.args.num_hidden + 1;
-    const bool along = need_projected && grad.gradient;
-    std::unique_ptr<S[]> along_map, along_slope;
-    if (need_projected) along_map = allocate_array<S>(in.num_samples * width);
-    if (along) along_slope = allocate_array<S>(in.num_samples * width);
-    std::vector<T> directions(along ? 2 * in.num_samples : 0);
+    const int64_t width = in.args.map.channels;
+    const bool slopes = need_projected && grad.gradient;
+    const AlongMap along{torch::stable::new_empty(in.map, {need_projected ? in.num_samples : 0, width}),
+                         torch::stable::new_empty(in.map, {slopes ? in.num_samples : 0, width}),
+                         torch::stable::new_empty(in.points, {slopes ? in.num_samples : 0, 2})};
     Tensor out_points = torch::stable::new_empty(in.points, {need_points ? frames : 0, count, 3});
     Tensor out_parameters = torch::stable::new_empty(in.parameters, {need_parameters ? parameters.size(0) : 0});
-
-    // Each block's sums: dW [outputs, columns] and db of one layer after the other.
-    int64_t block_sums = 0;
-    for (int64_t l = 0; l < layers; ++l) block_sums += widths[l + 1] * (in.columns(l) + 1);
-    const Blocks blocks = product_sums(in.num_samples, block_sums * int64_t(sizeof(T)));
-    std::unique_ptr<T[]> sums;
-    if (need_parameters) sums = allocate_array<T>(blocks.count() * block_sums);
-    const FieldKernels<S>& k = decode_field_kernels<S>();
-    parallel(blocks.count(), 1, [&](int64_t first, int64_t last) {
-      const auto scratch = allocate_array<char>(k.scratch_bytes(in.args, true));
-      for (int64_t block = first; block < last; ++block) {
-        T* part = sums ? sums.get() + block * block_sums : nullptr;
-        if (part) std::fill(part, part + block_sums, T(0));
-        const FieldGradients<S> out{part, along_map.get(), along_slope.get(),
-                                    directions.empty() ? nullptr : directions.data(),
-                                    need_points ? out_points.mutable_data_ptr<T>() : nullptr};
-        k.backward(in.args, saved, grad, out, scratch.get(), blocks.begin(block), blocks.end(block), in.num_samples);
-      }
-    });
-
-    if (need_parameters) {
-      T* to = out_parameters.mutable_data_ptr<T>();
-      const T* from = sums.get();
-      for (int64_t l = 0; l < layers; ++l) {
-        const int64_t outputs = widths[l + 1], inputs = widths[l], columns = in.columns(l);
-        add_blocks(from, blocks.count(), block_sums, outputs, columns, inputs, to);
-        from += outputs * columns;
-        to += outputs * inputs;
-        add_blocks(from, blocks.count(), block_sums, 1, 0, outputs, to);
-        from += outputs;
-        to += outputs;
-      }
-    }
+    backward<S>(in, saved, grad, along, need_points ? out_points.mutable_data_ptr<T>() : nullptr,
+                need_parameters ? out_parameters.mutable_data_ptr<T>() : nullptr);
     Tensor out_map = torch::stable::new_empty(in.map, {0});
     if (need_projected) {
       in.make_grid();
-      in.args.map.grad = along_map.get();
-      in.args.map.grad_along = along_slope.get();
-      in.args.map.grad_grad_grid = directions.empty() ? nullptr : directions.data();
+      in.args.map.grad = storage<S>(along.rows);
+      in.args.map.grad_along = slopes ? storage<S>(along.slopes) : nullptr;
+      in.args.map.grad_grad_grid = slopes ? storage<T>(along.directions) : nullptr;
       out_map = SampleBev::scatter<S>(op, in.map, in.args.map, false, nullptr);
     }
     return std::make_tuple(out_map, out_points, out_parameters);
@@ -309,7 +350,7 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) {
-  m.impl("decode_field", TORCH_BOX(&pred::decode_field));
-  m.impl("decode_field_backward", TORCH_BOX(&pred::decode_field_backward));
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) {
+  PRED_IMPL(m, "decode_field", &pred::decode_field);
+  PRED_IMPL(m, "decode_field_backward", &pred::decode_field_backward);
 }

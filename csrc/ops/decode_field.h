@@ -48,7 +48,8 @@ struct FieldArgs {
   int64_t octaves;
   T beta, sdf_scale;
   int64_t num_hidden, num_outputs;  // outputs: 1, or 1 + K
-  // Packed: up[l] is W_l^T, [inputs, width]; down[l] is W_l, [width, inputs]. Index num_hidden is the output layer.
+  // Not where kernels are launched, which take the parameters as they are. Packed: up[l] is W_l^T, [inputs, width];
+  // down[l] is W_l, [width, inputs]. Index num_hidden is the output layer.
   const S* first;  // up[0] in kFieldParts<S> parts
   const S* up[kMaxHidden + 1];
   const S* down[kMaxHidden + 1];
@@ -76,13 +77,28 @@ struct FieldCotangents {
 // Gradients; null where not wanted.
 template <typename S>
 struct FieldGradients {
-  Compute<S>* parameters;  // one block's part: dW_l [width, columns], db_l [width] for each layer
-  S* along_map;            // [B N, width] x_1
-  S* along_slope;          // [B N, width] g_1, with a cotangent of the gradient
+  Compute<S>*
+      parameters;  // one block's part: dW_l [width, columns], db_l [width] for each layer; launched, all of them
+  S* along_map;    // [B N, width] x_1
+  S* along_slope;  // [B N, width] g_1, with a cotangent of the gradient
   Compute<S>* directions;  // [B N, 2] v of the map's axes, with a cotangent of the gradient
   Compute<S>* points;      // [B N, 3]
 };
 
+#ifdef PRED_LAUNCH
+// `parameters`: W_l [outputs, inputs], b_l [outputs] for each layer.
+template <typename S>
+struct FieldKernels {
+  using T = Compute<S>;
+  int64_t (*workspace_bytes)(const FieldArgs<S>&, int64_t num_samples, bool backward);
+  void (*forward)(const FieldArgs<S>&, const T* parameters, const FieldSaved<S>&, const FieldOutputs<S>&,
+                  char* workspace, int64_t num_samples);
+  void (*backward)(const FieldArgs<S>&, const T* parameters, const FieldSaved<S>&, const FieldCotangents<S>&,
+                   const FieldGradients<S>&, char* workspace, int64_t num_samples);
+  // Of the samples in the map, [B N, 2], as sample_bev takes them.
+  void (*positions)(const FieldArgs<S>&, T* grid, int64_t num_samples);
+};
+#else
 template <typename S>
 struct FieldKernels {
   using T = Compute<S>;
@@ -97,6 +113,7 @@ struct FieldKernels {
   void (*backward)(const FieldArgs<S>&, const FieldSaved<S>&, const FieldCotangents<S>&, const FieldGradients<S>&,
                    char* scratch, int64_t begin, int64_t end, int64_t num_samples);
 };
+#endif
 
 }  // namespace pred
 

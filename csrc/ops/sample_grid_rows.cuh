@@ -1,0 +1,98 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Rows of channels on the device: a group of lanes moves a row, 16 bytes to an access where rows allow it.
+#pragma once
+
+#include <type_traits>
+
+#include "common/warp.cuh"
+#include "ops/sample_grid.h"
+
+namespace pred::PRED_ISA {
+namespace {
+
+// Neighbouring channels that one access moves.
+template <typename S, int V>
+struct alignas(V * sizeof(S)) Pack {
+  S x[V];
+};
+
+// value[v] = from[v], or 0 where there is none.
+template <int V, typename S>
+PRED_DEVICE_ONLY void load_pack(const S* from, Compute<S> (&value)[V]) {
+  Pack<S, V> pack;
+  if (from) pack = *reinterpret_cast<const Pack<S, V>*>(from);
+#pragma unroll
+  for (int v = 0; v < V; ++v) value[v] = from ? widen(pack.x[v]) : Compute<S>(0);
+}
+
+template <int V, typename S>
+PRED_DEVICE_ONLY void store_pack(S* to, const Compute<S> (&value)[V]) {
+  Pack<S, V> pack;
+#pragma unroll
+  for (int v = 0; v < V; ++v) pack.x[v] = narrow<S>(value[v]);
+  *reinterpret_cast<Pack<S, V>*>(to) = pack;
+}
+
+// Lanes that share one sample, a power of 2.
+struct Group {
+  int size, lane;
+
+  __device__ explicit Group(int lanes) : size(lanes), lane(lane_number() % lanes) {}
+  // Samples are numbered so that the groups of a warp have neighbouring ones.
+  __device__ int64_t first() const { return first_thread() / size; }
+  __device__ int64_t stride() const { return thread_stride() / size; }
+};
+
+PRED_DEVICE_ONLY int64_t divide(int64_t a, int64_t b) {
+  return ((a | b) >> 32) == 0 ? int64_t(uint32_t(a) / uint32_t(b)) : a / b;  // the latter takes some 100 instructions
+}
+
+// The rows of the map between which a sample lies; null outside of it.
+template <typename S, int Axes>
+struct Corners {
+  const S* row[1 << Axes];
+  bool any;
+
+  __device__ Corners(const S* map, const SampleGridArgs<S, Axes>& a, const LinearStencil<Compute<S>, Axes>& s) {
+    any = false;
+#pragma unroll
+    for (int k = 0; k < 1 << Axes; ++k) {
+      int64_t offset = 0;
+      for (int axis = 0; axis < Axes; ++axis) offset += (s.axis[axis].low + (k >> axis & 1)) * a.stride[axis];
+      const bool inside = linear_inside(s, k);
+      row[k] = inside ? map + offset : nullptr;
+      any = any || inside;
+    }
+  }
+};
+
+// Channels of an access: 16 bytes where rows allow it.
+template <typename S, class... Rows>
+bool in_packs(int64_t channels, const Rows*... rows) {
+  constexpr int64_t kBytes = 16;
+  return channels * int64_t(sizeof(S)) % kBytes == 0 && ((reinterpret_cast<uintptr_t>(rows) | ...) % kBytes) == 0;
+}
+
+template <typename S>
+constexpr int kPack = 16 / int(sizeof(S));
+
+inline int lanes_for(int64_t pieces) {
+  int lanes = 1;
+  while (lanes < kWarp && lanes < pieces) lanes *= 2;
+  return lanes;
+}
+
+// Calls body(std::integral_constant<int, V>, lanes of a group) with V channels to an access.
+template <typename S, class Body>
+void by_pack(bool packs, int64_t channels, const Body& body) {
+  if (packs) {
+    body(std::integral_constant<int, kPack<S>>(), lanes_for(channels / kPack<S>));
+  } else {
+    body(std::integral_constant<int, 1>(), lanes_for(channels));
+  }
+}
+
+}  // namespace
+}  // namespace pred::PRED_ISA
