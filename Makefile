@@ -81,7 +81,7 @@ sanitize: sanitized
 # CUDA kernels on the CPU, in a copy of the package; csrc/emulation/cuda.h says how. ORDER is that of a block's threads.
 EMULATED := $(CURDIR)/build/emulated
 ORDER ?= shuffled
-CUDA_OPS := composite_alpha composite_rays decode_field resample_rays sample_pdf sdf_to_alpha
+CUDA_OPS := composite_alpha composite_rays decode_field resample_rays sample_pdf sdf_to_alpha segment_reduce voxelize
 CUDA_TESTS := $(CUDA_OPS:%=tests/ops/test_%.py) tests/ops/test_composites.py tests/ops/test_sampling.py tests/test_emulation.py
 emulate: $(VENV)/dev.stamp
 	rm -rf $(EMULATED)

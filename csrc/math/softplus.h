@@ -29,7 +29,9 @@ PRED_HOST_DEVICE V log1p_unit(V e) {
     constexpr int terms = 17;
     const V u = e / (e + T(2)), u2 = u * u;
     V sum = V{} + T(2) / T(2 * terms - 1);
+#ifndef __CUDACC__
 #pragma GCC unroll 16
+#endif
     for (int k = terms - 2; k >= 0; --k) sum = sum * u2 + T(2) / T(2 * k + 1);
     return sum * u;
   }

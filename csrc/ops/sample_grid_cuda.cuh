@@ -236,22 +236,6 @@ __global__ void pack_kernel(SampleGridArgs<S, Axes> a, LowerCorners<Axes> corner
   }
 }
 
-// start[key] = the first item of this key or a higher one.
-static __global__ void start_kernel(const uint64_t* items, int64_t num_items, int number_bits, int64_t num_keys,
-                                    int64_t* start) {
-  for (int64_t key = first_thread(); key <= num_keys; key += thread_stride()) {
-    int64_t low = 0, high = num_items;
-    while (low < high) {
-      const int64_t middle = (low + high) / 2;
-      if (int64_t(items[middle] >> number_bits) < key)
-        low = middle + 1;
-      else
-        high = middle;
-    }
-    start[key] = low;
-  }
-}
-
 // The weights with which a sample's gradient rows are added to its cells.
 template <int kRows, typename S, int Axes>
 PRED_DEVICE_ONLY void scatter_weights(const SampleGridArgs<S, Axes>& a, int64_t sample, bool along_direction,
@@ -422,8 +406,7 @@ void scatter(const SampleGridArgs<S, Axes>& a, int64_t batch, bool along_directi
   launch_threads(pack_kernel<S, Axes>, num_samples, a, corners, num_samples, space.items);
   sort_items(space.sort, space.sort_bytes, space.items, space.sorted, num_samples, corners.number_bits,
              corners.number_bits + corners.key_bits);
-  launch_threads(start_kernel, corners.count + 1, static_cast<const uint64_t*>(space.sorted), num_samples,
-                 corners.number_bits, corners.count, space.start);
+  find_runs(space.sorted, num_samples, corners.number_bits, corners.count, space.start);
   if (a.grad_along) {
     scatter_rows<kAlong>(a, batch, false, grad_map, corners, space);
   } else if (a.grad_slopes) {

@@ -32,6 +32,18 @@ struct SegmentReduceArgs {
   int64_t num_rows, channels;
 };
 
+#ifdef PRED_LAUNCH
+// An index outside of [-1, num_segments) counts as -1.
+template <typename S>
+struct SegmentReduceKernels {
+  int64_t (*workspace_bytes)(int64_t num_rows, int64_t num_segments);
+  // saved: as below.
+  void (*forward)(SegmentReduction, const SegmentReduceArgs<S>&, int64_t num_segments, S* out, int32_t* saved,
+                  char* workspace);
+  void (*backward)(SegmentReduction, const S* grad, int64_t num_segments, int64_t channels, const int64_t* index,
+                   const int32_t* saved, S* out, int64_t num_rows);
+};
+#else
 template <typename S>
 struct SegmentReduceKernels {
   using T = Compute<S>;
@@ -45,6 +57,7 @@ struct SegmentReduceKernels {
   void (*backward[3])(const S* grad, int64_t channels, const int64_t* index, const int32_t* saved, S* out,
                       int64_t begin, int64_t end);
 };
+#endif
 
 }  // namespace pred
 

@@ -8,11 +8,34 @@
 #include <tuple>
 #include <vector>
 
+#include "ops/voxelize_inputs.h"
+#ifndef PRED_LAUNCH
 #include "ops/voxelize_sort.h"
+#endif
 
 namespace pred {
 namespace {
 
+#ifdef PRED_LAUNCH
+PRED_KERNELS_BY_STORAGE(VoxelizeKernels, voxelize)
+
+template <typename S>
+std::tuple<Tensor, Tensor, Tensor> voxels(const VoxelizeInputs& in, const Tensor& point_to_voxel) {
+  const VoxelizeKernels<S>& k = voxelize_kernels<S>();
+  const VoxelizePoints<S> a = in.arguments<S>();
+  const int64_t num_points = in.num_points();
+  const Tensor workspace =
+      torch::stable::new_empty(point_to_voxel, {k.workspace_bytes(num_points, in.key_bits)}, ScalarType::Byte);
+  char* space = mutable_storage<char>(workspace);
+  const int64_t num_voxels = k.number(a, in.offsets.const_data_ptr<int64_t>(), in.num_frames(), num_points, in.key_bits,
+                                      point_to_voxel.mutable_data_ptr<int64_t>(), space);
+  Tensor coords = torch::stable::new_empty(point_to_voxel, {num_voxels, 4});
+  Tensor counts = torch::stable::new_empty(point_to_voxel, {num_voxels});
+  k.write(a.bits, num_points, in.key_bits, coords.mutable_data_ptr<int64_t>(), counts.mutable_data_ptr<int64_t>(),
+          space);
+  return {coords, point_to_voxel, counts};
+}
+#else
 // The three outputs, for items of one width.
 template <typename S, typename Item>
 std::tuple<Tensor, Tensor, Tensor> number_voxels(const VoxelizePoints<S>& a, const SortedItems<Item>& sorted,
@@ -41,6 +64,14 @@ std::tuple<Tensor, Tensor, Tensor> number_voxels(const VoxelizePoints<S>& a, con
   return {coords, point_to_voxel, counts};
 }
 
+template <typename S>
+std::tuple<Tensor, Tensor, Tensor> voxels(const VoxelizeInputs& in, const Tensor& point_to_voxel) {
+  return with_sorted_points<S>(in, point_to_voxel.mutable_data_ptr<int64_t>(), [&](const auto& a, const auto& sorted) {
+    return number_voxels(a, sorted, point_to_voxel);
+  });
+}
+#endif
+
 std::tuple<Tensor, Tensor, Tensor> voxelize(const Tensor& points, const Tensor& batch_offsets,
                                             std::vector<double> voxel_size, std::vector<double> point_range,
                                             std::vector<int64_t> grid_size) {
@@ -48,13 +79,11 @@ std::tuple<Tensor, Tensor, Tensor> voxelize(const Tensor& points, const Tensor& 
   const VoxelizeInputs in(op, points, batch_offsets, voxel_size, point_range, grid_size);
   return PRED_DISPATCH_STORAGE(op, points.scalar_type(), [&] {
     Tensor point_to_voxel = torch::stable::new_empty(in.offsets, {in.num_points()});
-    return with_sorted_points<S>(
-        in, point_to_voxel.mutable_data_ptr<int64_t>(),
-        [&](const auto& a, const auto& sorted) { return number_voxels(a, sorted, point_to_voxel); });
+    return voxels<S>(in, point_to_voxel);
   });
 }
 
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) { m.impl("voxelize", TORCH_BOX(&pred::voxelize)); }
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) { PRED_IMPL(m, "voxelize", &pred::voxelize); }

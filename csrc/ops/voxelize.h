@@ -66,6 +66,23 @@ struct VoxelizePoints {
   VoxelKeyBits bits;
 };
 
+PRED_HOST_DEVICE uint64_t voxel_key(const VoxelKeyBits& bits, int64_t frame, int32_t x, int32_t y, int32_t z) {
+  return ((((uint64_t(frame) << bits.z) | uint64_t(z)) << bits.y | uint64_t(y)) << bits.x) | uint64_t(x);
+}
+
+#ifdef PRED_LAUNCH
+// Keys, of at most 62 bits, stand apart from rows here.
+template <typename S>
+struct VoxelizeKernels {
+  int64_t (*workspace_bytes)(int64_t num_points, int key_bits);
+  // Sorts the points by voxel, numbers these, and returns how many there are; point_to_voxel gets the numbers.
+  int64_t (*number)(const VoxelizePoints<S>&, const int64_t* offsets, int64_t num_frames, int64_t num_points,
+                    int key_bits, int64_t* point_to_voxel, char* workspace);
+  // Writes them, from the same workspace.
+  void (*write)(const VoxelKeyBits&, int64_t num_points, int key_bits, int64_t* coords, int64_t* counts,
+                char* workspace);
+};
+#else
 template <typename S, typename Item>
 struct VoxelizeKernels {
   // Packs the points [begin, end) of one frame that lie inside, from `items` on; returns how many. The others
@@ -78,8 +95,10 @@ struct VoxelizeKernels {
   void (*write)(const Item* items, int64_t num_items, const VoxelKeyBits&, int64_t first_voxel, int64_t begin,
                 int64_t end, int64_t* coords, int64_t* counts, int64_t* point_to_voxel);
 };
+#endif
 
 // Keys and row numbers that need more than 64 bits together are rare, but must work.
+#ifndef PRED_LAUNCH
 using WideItem = unsigned __int128;
 using VoxelizeF32 = VoxelizeKernels<float, uint64_t>;
 using VoxelizeF64 = VoxelizeKernels<double, uint64_t>;
@@ -89,9 +108,16 @@ using VoxelizeWideF32 = VoxelizeKernels<float, WideItem>;
 using VoxelizeWideF64 = VoxelizeKernels<double, WideItem>;
 using VoxelizeWideBF16 = VoxelizeKernels<BFloat16, WideItem>;
 using VoxelizeWideF16 = VoxelizeKernels<Float16, WideItem>;
+#endif
 
 }  // namespace pred
 
+#ifdef PRED_LAUNCH
+PRED_DECLARE_KERNELS(VoxelizeKernels<float>, voxelize_f32)
+PRED_DECLARE_KERNELS(VoxelizeKernels<double>, voxelize_f64)
+PRED_DECLARE_KERNELS(VoxelizeKernels<BFloat16>, voxelize_bf16)
+PRED_DECLARE_KERNELS(VoxelizeKernels<Float16>, voxelize_f16)
+#else
 PRED_DECLARE_KERNELS(VoxelizeF32, voxelize_f32)
 PRED_DECLARE_KERNELS(VoxelizeF64, voxelize_f64)
 PRED_DECLARE_KERNELS(VoxelizeBF16, voxelize_bf16)
@@ -100,3 +126,4 @@ PRED_DECLARE_KERNELS(VoxelizeWideF32, voxelize_wide_f32)
 PRED_DECLARE_KERNELS(VoxelizeWideF64, voxelize_wide_f64)
 PRED_DECLARE_KERNELS(VoxelizeWideBF16, voxelize_wide_bf16)
 PRED_DECLARE_KERNELS(VoxelizeWideF16, voxelize_wide_f16)
+#endif

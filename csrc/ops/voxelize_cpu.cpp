@@ -37,9 +37,7 @@ static int64_t pack(const VoxelizePoints<S>& a, int64_t frame, int64_t begin, in
         point_to_voxel[start + i] = -1;
         continue;
       }
-      const uint64_t key =
-          ((((uint64_t(frame) << bits.z) | uint64_t(z)) << bits.y | uint64_t(y)) << bits.x) | uint64_t(x);
-      items[count++] = (Item(key) << bits.row) | Item(start + i);
+      items[count++] = (Item(voxel_key(bits, frame, x, y, z)) << bits.row) | Item(start + i);
     }
   }
   return count;

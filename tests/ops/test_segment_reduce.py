@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pred.ops import reference, segment_reduce
-from tests.conftest import KERNEL_ERROR, SANITIZED
+from tests.conftest import KERNEL_ERROR, LAUNCHED, SANITIZED, require_value_checks
 from tests.tolerances import FORWARD, GRADIENT, assert_close
 
 REDUCTIONS = ("sum", "mean", "max")
@@ -190,6 +190,11 @@ def test_errors(backend: str) -> None:
         segment_reduce(features, index, 12, "min")
     with pytest.raises(ValueError, match="segment_reduce: num_segments must be at least 0, got -1"):
         segment_reduce(features, index, -1)
+
+
+def test_index_is_checked(backend: str) -> None:
+    require_value_checks(backend)
+    features, index = case()
     for wrong in (12, -2, 2**62, -(2**62)):
         index[[17, 30]] = wrong
         message = rf"segment_reduce: index must lie in \[-1, num_segments=12\), got {wrong} in row 17"
@@ -212,10 +217,24 @@ def test_direct_calls_are_checked(native: None) -> None:
         torch.ops.pred.segment_reduce(features, index[:3], 12, "sum")
     with pytest.raises(KERNEL_ERROR, match="dtype must be float32, float64, bfloat16 or float16, got Long"):
         torch.ops.pred.segment_reduce(features.long(), index, 12, "sum")
-    with pytest.raises(KERNEL_ERROR, match=r"index must lie in \[-1, num_segments=11\)"):
-        backward(features[:11], torch.full((4,), 11), torch.empty(0, dtype=torch.int32), "sum")
     with pytest.raises(KERNEL_ERROR, match=r"saved must belong to grad of shape \[12, 5\], got \[12, 4\]"):
         backward(features[:12], index, torch.zeros(12, 4, dtype=torch.int32), "max")
+    require_value_checks("native")
+    with pytest.raises(KERNEL_ERROR, match=r"index must lie in \[-1, num_segments=11\)"):
+        backward(features[:11], torch.full((4,), 11), torch.empty(0, dtype=torch.int32), "sum")
+
+
+@pytest.mark.skipif(not LAUNCHED, reason="the index is checked")
+@pytest.mark.parametrize("reduce", ["sum", "mean", "max"])
+def test_unchecked_numbers_count_as_none(native: None, reduce: str) -> None:
+    features, index = case()
+    none, wrong = index.clone(), index.clone()
+    none[[3, 17, 30]] = -1
+    wrong[[3, 17, 30]] = torch.tensor([12, -5, 2**62])
+    expected, saved = torch.ops.pred.segment_reduce(features, none, 12, reduce)
+    assert torch.equal(torch.ops.pred.segment_reduce(features, wrong, 12, reduce)[0], expected)
+    backward = torch.ops.pred.segment_reduce_backward
+    assert torch.equal(backward(expected, wrong, saved, reduce), backward(expected, none, saved, reduce))
 
 
 SCRATCH_THAT_DOES_NOT_FIT = """
