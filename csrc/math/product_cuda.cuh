@@ -34,6 +34,7 @@ constexpr int kTileK = 64 / int(sizeof(S));
 // Rows that a product reads: `data` + row * stride, where there are so many.
 template <typename S>
 struct ProductRows {
+  static constexpr bool kSparse = false;
   const S* data;
   int64_t stride, rows;
 
@@ -236,13 +237,17 @@ PRED_DEVICE_ONLY void wait_for_copies() {
 // Sizes of a product. Inner: results [m, n] = sum over k of left[m, k] right[n, k], over `segments` pairs of factors.
 // Outer: results [m, n] = sum over rows k of left[k, m] right[k, n], where `splits` blocks share the rows of a
 // segment. Rows hold whole chunks, of which those of k (inner), of m and n (outer) are read.
+constexpr int kMostSparseSegments = 512;
+
 struct ProductSizes {
   int64_t m, n, k;
   int segments, splits;
 };
 
-// Left and Right: const S* row(int64_t i, int segment), null for a row of zeros. The epilogue gets
-// (row, column, split, value, value of the next column), for rows below m and columns below n, from one thread each.
+// Left and Right: const S* row(int64_t i, int segment), null for a row of zeros. Left::kSparse: most rows are, and
+// segments of an inner product for which all of a tile's are, are left out, if there are not too many. The epilogue
+// gets (row, column, split, value, value of the next column), for rows below m and columns below n, from one thread
+// each.
 template <typename S, bool kOuter, class Left, class Right, class Epilogue>
 __global__ void __launch_bounds__(kProductThreads)
     product_kernel(ProductSizes sizes, Left left, Right right, Epilogue epilogue) {
@@ -251,6 +256,8 @@ __global__ void __launch_bounds__(kProductThreads)
   __shared__ Tile tiles[2][2];  // stage, factor
   const int64_t tiles_n = (sizes.n + kTileN - 1) / kTileN, tiles_m = (sizes.m + kTileM - 1) / kTileM;
   const int warp = int(threadIdx.x) / kWarp;
+  __shared__ int used[Left::kSparse ? kMostSparseSegments : 1], num_used;
+  const bool by_list = Left::kSparse && sizes.segments <= kMostSparseSegments;
   const int row0 = warp % (kTileM / kWarpM) * kWarpM, column0 = warp / (kTileM / kWarpM) * kWarpN;
   for (int64_t task = blockIdx.x; task < tiles_m * tiles_n * sizes.splits; task += gridDim.x) {
     const int split = int(task / (tiles_m * tiles_n));
@@ -258,9 +265,25 @@ __global__ void __launch_bounds__(kProductThreads)
                   first_n = tile % tiles_n * kTileN;
     const int64_t steps_all = (sizes.k + kTileK<S> - 1) / kTileK<S>;
     const int64_t step0 = steps_all * split / sizes.splits, step1 = steps_all * (split + 1) / sizes.splits;
-    const int64_t steps = (step1 - step0) * sizes.segments;
+    if (by_list) {
+      for (int segment = warp; segment < sizes.segments; segment += kProductThreads / kWarp) {
+        bool any = false;
+        for (int i = lane_number(); i < kTileM; i += kWarp) any = any || left.row(first_m + i, segment);
+        any = __any_sync(kWholeWarp, any);
+        if (lane_number() == 0) used[segment] = any;
+      }
+      __syncthreads();
+      if (threadIdx.x == 0) {
+        num_used = 0;
+        for (int segment = 0; segment < sizes.segments; ++segment) {
+          if (used[segment]) used[num_used++] = segment;
+        }
+      }
+      __syncthreads();
+    }
+    const int64_t steps = (step1 - step0) * (by_list ? num_used : sizes.segments);
     const auto fetch = [&](int64_t step) {
-      const int segment = int(step / (step1 - step0));
+      const int place = int(step / (step1 - step0)), segment = by_list ? used[place] : place;
       const int64_t k0 = (step0 + step % (step1 - step0)) * kTileK<S>;
 #pragma unroll
       for (int factor = 0; factor < 2; ++factor) {
@@ -301,6 +324,7 @@ __global__ void __launch_bounds__(kProductThreads)
         }
       }
     }
+    if (by_list) __syncthreads();  // all have read the list
   }
 }
 
@@ -370,6 +394,7 @@ __global__ void add_splits_kernel(const T* parts, int64_t count, int splits, T* 
 // Blocks that share the rows of an outer product, so that each has some hundred rows and the device is busy.
 inline int outer_splits(int64_t m, int64_t n, int64_t rows) {
   constexpr int64_t kBlocks = 264, kLeastRows = 512;  // two per multiprocessor of a large device
+  if (m == 0 || n == 0) return 1;
   const int64_t tiles = (m + kTileM - 1) / kTileM * ((n + kTileN - 1) / kTileN);
   const int64_t wanted = (kBlocks + tiles - 1) / tiles, most = (rows + kLeastRows - 1) / kLeastRows;
   return int(wanted < most ? wanted : most < 1 ? 1 : most);

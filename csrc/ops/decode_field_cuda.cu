@@ -578,6 +578,7 @@ void reverse(const FieldArgs<S>& a, const Space<S>& space, int64_t rows, bool ha
 // Two factors one after the other.
 template <typename S>
 struct TwoRows {
+  static constexpr bool kSparse = false;
   ProductRows<S> of[2];
 
   __device__ const S* row(int64_t i, int segment) const { return segment ? of[1].row(i, 0) : of[0].row(i, 0); }

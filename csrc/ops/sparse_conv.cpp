@@ -40,6 +40,40 @@ struct Problem {
   }
 };
 
+#ifdef PRED_LAUNCH
+// The same functions for kernels that are launched.
+template <typename S>
+Tensor workspace_for(const Problem& in, const SparseConvArgs<S>& a, bool of_weight, int64_t rows, int64_t source_rows) {
+  const int64_t bytes = sparse_conv_kernels<S>().workspace_bytes(a, of_weight, rows, source_rows);
+  return torch::stable::new_empty(in.features, {bytes}, ScalarType::Byte);
+}
+
+template <typename S>
+void product(const Problem& in, const Tensor& table, const S* source, bool transposed, const S* bias, S* out) {
+  SparseConvArgs<S> a{
+      table.const_data_ptr<int32_t>(), in.taps, in.inputs, in.outputs, source, nullptr, 0, bias, nullptr};
+  if (transposed) std::swap(a.inputs, a.outputs);
+  const int64_t rows = transposed ? in.rows_in : in.rows_out, source_rows = transposed ? in.rows_out : in.rows_in;
+  const Tensor workspace = workspace_for(in, a, false, rows, source_rows);
+  sparse_conv_kernels<S>().product(a, storage<S>(in.weight), transposed, out, mutable_storage<char>(workspace), rows,
+                                   source_rows);
+}
+
+template <typename S>
+void weight_gradient(const Problem& in, const S* grad, S* out) {
+  const SparseConvArgs<S> a{in.out_to_in.const_data_ptr<int32_t>(),
+                            in.taps,
+                            in.inputs,
+                            in.outputs,
+                            storage<S>(in.features),
+                            nullptr,
+                            0,
+                            nullptr,
+                            grad};
+  const Tensor workspace = workspace_for(in, a, true, in.rows_out, in.rows_in);
+  sparse_conv_kernels<S>().weight(a, out, mutable_storage<char>(workspace), in.rows_out, in.rows_in);
+}
+#else
 // out [rows, outputs] of a product along a table, whose matrices are W_k, or W_k^T if `transposed`.
 template <typename S>
 void product(const Problem& in, const Tensor& table, const S* source, bool transposed, const S* bias, S* out) {
@@ -50,7 +84,7 @@ void product(const Problem& in, const Tensor& table, const S* source, bool trans
   if (transposed) std::swap(a.inputs, a.outputs);
   a.packed_size = k.packed_size(a.inputs, a.outputs);
   const auto packed = allocate_array<char>(in.taps * a.packed_size * int64_t(sizeof(Factor<S>)) + Arena::kAlignment);
-  Factor<S>* matrices = Arena(packed.get()).template take<Factor<S>>(in.taps * a.packed_size);
+  Factor<S>* matrices = Arena(packed.get()).template take<Factor<S> >(in.taps * a.packed_size);
   const S* weight = storage<S>(in.weight);
   const int64_t tap_stride = in.inputs, output_stride = in.taps * in.inputs;
   parallel(in.taps, 1, [&](int64_t begin, int64_t end) {
@@ -112,6 +146,7 @@ void weight_gradient(const Problem& in, const S* grad, S* out) {
     }
   }
 }
+#endif
 
 Tensor sparse_conv(const Tensor& features, const Tensor& weight, const std::optional<Tensor>& bias_in,
                    const Tensor& out_to_in, const Tensor& in_to_out) {
@@ -156,7 +191,7 @@ std::tuple<Tensor, Tensor> sparse_conv_backward(const Tensor& grad_in, const Ten
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) {
-  m.impl("sparse_conv", TORCH_BOX(&pred::sparse_conv));
-  m.impl("sparse_conv_backward", TORCH_BOX(&pred::sparse_conv_backward));
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) {
+  PRED_IMPL(m, "sparse_conv", &pred::sparse_conv);
+  PRED_IMPL(m, "sparse_conv_backward", &pred::sparse_conv_backward);
 }

@@ -34,6 +34,18 @@ struct SparseConvArgs {
   const S* grad;            // [rows, outputs]; of the weight's gradient alone
 };
 
+#ifdef PRED_LAUNCH
+// A table's number that is no row counts as -1.
+template <typename S>
+struct SparseConvKernels {
+  int64_t (*workspace_bytes)(const SparseConvArgs<S>&, bool of_weight, int64_t rows, int64_t source_rows);
+  // weight: [outputs, K, inputs], or [inputs, K, outputs] where the product is with the transposed matrices.
+  void (*product)(const SparseConvArgs<S>&, const S* weight, bool transposed, S* out, char* workspace, int64_t rows,
+                  int64_t source_rows);
+  // grad_weight: [outputs, K, inputs].
+  void (*weight)(const SparseConvArgs<S>&, S* grad_weight, char* workspace, int64_t rows, int64_t source_rows);
+};
+#else
 template <typename S>
 struct SparseConvKernels {
   using T = Compute<S>;
@@ -50,6 +62,7 @@ struct SparseConvKernels {
   // Whether a table's numbers [begin, end) lie in [-1, rows).
   bool (*is_valid)(const int32_t* table, int64_t rows, int64_t begin, int64_t end);
 };
+#endif
 
 }  // namespace pred
 

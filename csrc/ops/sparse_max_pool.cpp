@@ -35,7 +35,8 @@ std::tuple<Tensor, Tensor> sparse_max_pool(const Tensor& features_in, const Tens
     S* data = mutable_storage<S>(out);
     int32_t* winners = winner.mutable_data_ptr<int32_t>();
     parallel(rows_out, row_grain(channels, taps), [&](int64_t begin, int64_t end) {
-      k.forward(storage<S>(features), channels, table.const_data_ptr<int32_t>(), taps, data, winners, begin, end);
+      k.forward(storage<S>(features), rows_in, channels, table.const_data_ptr<int32_t>(), taps, data, winners, begin,
+                end);
     });
     return std::make_tuple(out, winner);
   });
@@ -55,8 +56,8 @@ Tensor sparse_max_pool_backward(const Tensor& grad_in, const Tensor& winner_in, 
     const auto& k = sparse_max_pool_kernels<S>();
     S* data = mutable_storage<S>(out);
     parallel(rows_in, row_grain(channels, taps), [&](int64_t begin, int64_t end) {
-      k.backward(storage<S>(grad), winner.const_data_ptr<int32_t>(), channels, table.const_data_ptr<int32_t>(), taps,
-                 data, begin, end);
+      k.backward(storage<S>(grad), winner.const_data_ptr<int32_t>(), rows_out, channels,
+                 table.const_data_ptr<int32_t>(), taps, data, begin, end);
     });
     return out;
   });
@@ -65,7 +66,7 @@ Tensor sparse_max_pool_backward(const Tensor& grad_in, const Tensor& winner_in, 
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) {
-  m.impl("sparse_max_pool", TORCH_BOX(&pred::sparse_max_pool));
-  m.impl("sparse_max_pool_backward", TORCH_BOX(&pred::sparse_max_pool_backward));
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) {
+  PRED_IMPL(m, "sparse_max_pool", &pred::sparse_max_pool);
+  PRED_IMPL(m, "sparse_max_pool_backward", &pred::sparse_max_pool_backward);
 }

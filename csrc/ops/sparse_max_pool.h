@@ -15,11 +15,12 @@ namespace pred {
 
 template <typename S>
 struct SparseMaxPoolKernels {
-  // Rows [begin, end) of out and winner, [rows, channels]; table: [rows, taps].
-  void (*forward)(const S* features, int64_t channels, const int32_t* table, int64_t taps, S* out, int32_t* winner,
-                  int64_t begin, int64_t end);
-  void (*backward)(const S* grad, const int32_t* winner, int64_t channels, const int32_t* table, int64_t taps, S* out,
-                   int64_t begin, int64_t end);
+  // Rows [begin, end) of out and winner, [rows, channels]; table: [rows, taps], whose numbers are rows of `features`
+  // (of `grad`), of which there are source_rows, or count as -1.
+  void (*forward)(const S* features, int64_t source_rows, int64_t channels, const int32_t* table, int64_t taps, S* out,
+                  int32_t* winner, int64_t begin, int64_t end);
+  void (*backward)(const S* grad, const int32_t* winner, int64_t source_rows, int64_t channels, const int32_t* table,
+                   int64_t taps, S* out, int64_t begin, int64_t end);
 };
 
 }  // namespace pred

@@ -9,8 +9,8 @@ namespace pred::PRED_ISA {
 namespace {
 
 template <typename S>
-static void forward(const S* features, int64_t channels, const int32_t* table, int64_t taps, S* out, int32_t* winner,
-                    int64_t begin, int64_t end) {
+static void forward(const S* features, int64_t source_rows, int64_t channels, const int32_t* table, int64_t taps,
+                    S* out, int32_t* winner, int64_t begin, int64_t end) {
   for (int64_t row = begin; row < end; ++row) {
     S* __restrict best = out + row * channels;
     int32_t* __restrict from = winner + row * channels;
@@ -20,7 +20,7 @@ static void forward(const S* features, int64_t channels, const int32_t* table, i
     }
     for (int64_t tap = 0; tap < taps; ++tap) {
       const int64_t source = table[row * taps + tap];
-      if (source < 0) continue;
+      if (source < 0 || source >= source_rows) continue;
       const S* __restrict feature = features + source * channels;
       for (int64_t c = 0; c < channels; ++c) {
         const bool replace = (from[c] < 0) | replaces_maximum(widen(feature[c]), widen(best[c]));
@@ -32,8 +32,8 @@ static void forward(const S* features, int64_t channels, const int32_t* table, i
 }
 
 template <typename S>
-static void backward(const S* grad, const int32_t* winner, int64_t channels, const int32_t* table, int64_t taps, S* out,
-                     int64_t begin, int64_t end) {
+static void backward(const S* grad, const int32_t* winner, int64_t source_rows, int64_t channels, const int32_t* table,
+                     int64_t taps, S* out, int64_t begin, int64_t end) {
   using T = Compute<S>;
   constexpr int64_t kColumns = 64;
   T sum[kColumns];
@@ -43,7 +43,7 @@ static void backward(const S* grad, const int32_t* winner, int64_t channels, con
       for (int64_t c = 0; c < count; ++c) sum[c] = T(0);
       for (int64_t tap = 0; tap < taps; ++tap) {
         const int64_t output = table[row * taps + tap];
-        if (output < 0) continue;
+        if (output < 0 || output >= source_rows) continue;
         const S* __restrict value = grad + output * channels + first;
         const int32_t* __restrict from = winner + output * channels + first;
         for (int64_t c = 0; c < count; ++c) sum[c] += from[c] == int32_t(row) ? widen(value[c]) : T(0);

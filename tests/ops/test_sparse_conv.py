@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pred.ops import build_rulebook, reference, sparse_conv, sparse_max_pool
 from pred.ops.build_rulebook import Rulebook, output_shape
-from tests.conftest import KERNEL_ERROR
+from tests.conftest import KERNEL_ERROR, LAUNCHED, require_value_checks
 
 Triple = tuple[int, int, int]
 
@@ -382,8 +382,6 @@ def test_direct_calls_are_checked(native: None) -> None:
         call.build_rulebook(line, 1, *sizes[:3], [0, 0, 2], [1, 1, 1], True)
     with pytest.raises(KERNEL_ERROR, match=r"spatial_shape must give at most 2\^62 sites .* got \[1073741824, "):
         call.build_rulebook(line, 1, [2**30] * 3, *sizes[1:], True)
-    with pytest.raises(KERNEL_ERROR, match=r"sparse_conv: out_to_in must lie in \[-1, 2\), got 2 in row 0"):
-        call.sparse_conv(features, weight, None, table + (table == 1), table)
     with pytest.raises(KERNEL_ERROR, match=r"sparse_conv: weight must have shape \[O, K, 4\], got \[3, 3, 5\]"):
         call.sparse_conv(features, torch.zeros(3, 3, 5), None, table, table)
     with pytest.raises(KERNEL_ERROR, match=r"sparse_conv: bias must have shape \[3\], got \[4\]"):
@@ -394,6 +392,32 @@ def test_direct_calls_are_checked(native: None) -> None:
         call.sparse_max_pool(features, table, table.long())
     with pytest.raises(KERNEL_ERROR, match=r"sparse_max_pool_backward: winner must have shape \[2, 4\], got \[3, 4\]"):
         call.sparse_max_pool_backward(features, torch.zeros(3, 4, dtype=torch.int32), table)
+    require_value_checks("native")
+    with pytest.raises(KERNEL_ERROR, match=r"sparse_conv: out_to_in must lie in \[-1, 2\), got 2 in row 0"):
+        call.sparse_conv(features, weight, None, table + (table == 1), table)
+
+
+@pytest.mark.skipif(not LAUNCHED, reason="the tables are checked")
+def test_unchecked_numbers_count_as_none(native: None) -> None:
+    table = torch.tensor([[-1, 0, 1], [0, 1, -1]], dtype=torch.int32)
+    wrong = torch.tensor([[2, 0, 1], [0, 1, -(2**31)]], dtype=torch.int32)
+    generator = torch.Generator().manual_seed(0)
+    features, weight = torch.randn(2, 4, generator=generator), torch.randn(3, 3, 4, generator=generator)
+    grad, call = torch.randn(2, 3, generator=generator), torch.ops.pred
+    assert torch.equal(
+        call.sparse_conv(features, weight, None, wrong, table), call.sparse_conv(features, weight, None, table, table)
+    )
+    for actual, expected in zip(
+        call.sparse_conv_backward(grad, features, weight, wrong, wrong, True, True),
+        call.sparse_conv_backward(grad, features, weight, table, table, True, True),
+        strict=True,
+    ):
+        assert torch.equal(actual, expected)
+    pooled, winner = call.sparse_max_pool(features, table, table)
+    assert torch.equal(call.sparse_max_pool(features, wrong, wrong)[0], pooled)
+    assert torch.equal(
+        call.sparse_max_pool_backward(features, winner, wrong), call.sparse_max_pool_backward(features, winner, table)
+    )
 
 
 @pytest.mark.parametrize(

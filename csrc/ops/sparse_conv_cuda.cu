@@ -1,0 +1,161 @@
+// Copyright 2026 The PRED authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// A convolution is one product (math/product_cuda.cuh) with as many segments as there are taps: the rows that a tap
+// reads are gathered into shared memory, and taps that a tile of outputs does not have are left out. Nothing is
+// scattered. The weight's gradient is an outer product per tap, of the same gathered rows.
+#include "common/workspace.h"
+#include "math/product_cuda.cuh"
+#include "ops/sparse_conv.h"
+
+namespace pred::PRED_ISA {
+namespace {
+
+// Row i of tap `segment`: the one that the table names. Of an outer product, `tap` alone.
+template <typename F>
+struct TableRows {
+  static constexpr bool kSparse = true;
+  const F* data;
+  int64_t stride, numbers;
+  const int32_t* table;
+  int64_t taps, rows, tap;
+
+  __device__ const F* row(int64_t i, int segment) const {
+    if (i >= rows) return nullptr;
+    const int64_t number = table[i * taps + tap + segment];
+    return number >= 0 && number < numbers ? data + number * stride : nullptr;
+  }
+};
+
+// Matrices [taps, outputs, stride] side by side.
+template <typename F>
+struct TapRows {
+  static constexpr bool kSparse = false;
+  const F* data;
+  int64_t stride, outputs;
+
+  __device__ const F* row(int64_t i, int segment) const {
+    return i < outputs ? data + (segment * outputs + i) * stride : nullptr;
+  }
+};
+
+template <typename S>
+struct StoreWithBias {
+  const S* bias;  // or null
+  S* out;
+  int64_t columns;
+
+  __device__ void operator()(int64_t row, int64_t column, int, Compute<S> value, Compute<S> next) const {
+    S* to = out + row * columns + column;
+    narrow_to(to[0], bias ? value + widen(bias[column]) : value);
+    if (column + 1 < columns) narrow_to(to[1], bias ? next + widen(bias[column + 1]) : next);
+  }
+};
+
+// to[tap, n, k] = weight[n, tap, k], or weight[k, tap, n] if transposed; 0 in columns that fill up a row.
+template <typename S, typename F>
+__global__ void pack_taps_kernel(const S* weight, int64_t taps, int64_t inputs, int64_t outputs, int64_t stride,
+                                 bool transposed, F* to) {
+  for (int64_t i = first_thread(); i < taps * outputs * stride; i += thread_stride()) {
+    const int64_t row = i / stride, k = i - row * stride, tap = row / outputs, n = row - tap * outputs;
+    const int64_t from = transposed ? (k * taps + tap) * outputs + n : (n * taps + tap) * inputs + k;
+    narrow_to(to[i], k < inputs ? Compute<F>(widen(weight[from])) : Compute<F>(0));
+  }
+}
+
+// grad[o, tap, c] = the sum of parts[split, o, c] over splits, in order.
+template <typename S, typename T = Compute<S>>
+__global__ void write_weight_kernel(const T* parts, int splits, int64_t taps, int64_t tap, int64_t outputs,
+                                    int64_t inputs, S* grad) {
+  const int64_t size = outputs * inputs;
+  for (int64_t i = first_thread(); i < size; i += thread_stride()) {
+    const int64_t o = i / inputs, c = i - o * inputs;
+    T sum = T(0);
+    for (int split = 0; split < splits; ++split) sum += parts[split * size + i];
+    narrow_to(grad[(o * taps + tap) * inputs + c], sum);
+  }
+}
+
+template <typename S>
+struct Space {
+  using F = Factor<S>;
+  F *source, *grad, *weight;
+  Compute<S>* parts;
+  int splits;
+  int64_t bytes;
+
+  Space(const SparseConvArgs<S>& a, bool of_weight, int64_t rows, int64_t source_rows, char* memory) {
+    Workspace space(memory);
+    const int64_t inputs = whole_chunks<F>(a.inputs);
+    splits = outer_splits(a.outputs, a.inputs, rows);
+    source = space.take<F>(source_rows * inputs);
+    grad = space.take<F>(of_weight ? rows * whole_chunks<F>(a.outputs) : 0);
+    weight = space.take<F>(of_weight ? 0 : a.taps * a.outputs * inputs);
+    parts = space.take<Compute<S>>(of_weight ? splits * a.outputs * a.inputs : 0);
+    bytes = space.bytes();
+  }
+};
+
+template <typename S>
+int64_t workspace_bytes(const SparseConvArgs<S>& a, bool of_weight, int64_t rows, int64_t source_rows) {
+  return Space<S>(a, of_weight, rows, source_rows, nullptr).bytes;
+}
+
+// Rows as factors: as they are where products can read them.
+template <typename S, typename F = Factor<S>>
+ProductRows<F> factor_rows(const S* rows, int64_t columns, int64_t count, F* space) {
+  if constexpr (std::is_same_v<S, F>) {
+    return readable_rows(rows, columns, count, space);
+  } else {
+    const int64_t stride = whole_chunks<F>(columns);
+    pack_rows(rows, columns, int64_t(1), count, columns, stride, space);
+    return {space, stride, count};
+  }
+}
+
+template <typename S, typename F = Factor<S>>
+TableRows<F> table_rows(const SparseConvArgs<S>& a, const ProductRows<F>& source, int64_t rows, int64_t tap) {
+  return {source.data, source.stride, source.rows, a.table, a.taps, rows, tap};
+}
+
+template <typename S>
+void product(const SparseConvArgs<S>& a, const S* weight, bool transposed, S* out, char* workspace, int64_t rows,
+             int64_t source_rows) {
+  using F = Factor<S>;
+  const Space<S> space(a, false, rows, source_rows, workspace);
+  const int64_t stride = whole_chunks<F>(a.inputs);
+  launch_threads(pack_taps_kernel<S, F>, a.taps * a.outputs * stride, weight, a.taps, a.inputs, a.outputs, stride,
+                 transposed, space.weight);
+  const ProductRows<F> source = factor_rows(a.source, a.inputs, source_rows, space.source);
+  launch_product<F, false>({rows, a.outputs, stride, int(a.taps), 1}, table_rows(a, source, rows, 0),
+                           TapRows<F>{space.weight, stride, a.outputs}, StoreWithBias<S>{a.bias, out, a.outputs});
+}
+
+template <typename S>
+void weight(const SparseConvArgs<S>& a, S* grad_weight, char* workspace, int64_t rows, int64_t source_rows) {
+  using F = Factor<S>;
+  using T = Compute<S>;
+  const Space<S> space(a, true, rows, source_rows, workspace);
+  const ProductRows<F> source = factor_rows(a.source, a.inputs, source_rows, space.source);
+  const ProductRows<F> grad = factor_rows(a.grad, a.outputs, rows, space.grad);
+  for (int64_t tap = 0; tap < a.taps; ++tap) {
+    launch_product<F, true>({a.outputs, a.inputs, rows, 1, space.splits}, grad, table_rows(a, source, rows, tap),
+                            AddToParts<T>{space.parts, a.outputs, a.inputs, true});
+    launch_threads(write_weight_kernel<S>, a.outputs * a.inputs, static_cast<const T*>(space.parts), space.splits,
+                   a.taps, tap, a.outputs, a.inputs, grad_weight);
+  }
+}
+
+template <typename S>
+constexpr SparseConvKernels<S> table() {
+  return {workspace_bytes<S>, product<S>, weight<S>};
+}
+
+}  // namespace
+
+const SparseConvKernels<float> sparse_conv_f32 = table<float>();
+const SparseConvKernels<double> sparse_conv_f64 = table<double>();
+const SparseConvKernels<BFloat16> sparse_conv_bf16 = table<BFloat16>();
+const SparseConvKernels<Float16> sparse_conv_f16 = table<Float16>();
+
+}  // namespace pred::PRED_ISA
