@@ -159,7 +159,8 @@ def evaluate_rendering(
     folder = RunFolder(run)
     folder.require()
     source = SpreadFrames(build_source(config.data, point_classes=True), max_frames)
-    trained_on = len(tokens_of(source) & trained_tokens(folder, config.data))
+    # Nobody knows which frames imported weights have seen.
+    trained_on = None if folder.is_imported() else len(tokens_of(source) & trained_tokens(folder, config.data))
     if all_returns and trained_on:
         raise ValueError(
             "evaluate: all_returns must go with frames that the run was not trained on, got "

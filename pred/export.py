@@ -93,8 +93,10 @@ def export(
     folder.require()
     # What cannot be written is refused before the long work.
     require_place(out)
-    if out.resolve().is_relative_to(folder.checkpoints.resolve()) or out.resolve() == folder.encoder.resolve():
-        raise ValueError(f"export: out must not replace what the run made, got {out}")
+    if out.resolve().is_relative_to(folder.path.resolve()):
+        raise ValueError(f"export: out must not lie in the run folder, whose files belong to the run, got {out}")
+    if checkpoint is not None and checkpoint.resolve() in (out.resolve(), sidecar(out).resolve()):
+        raise ValueError(f"export: out must not replace the checkpoint, got {out} and {checkpoint}")
     model, checkpoint = load_model(config, folder, checkpoint)
     conv_here = has_conv_for_no_stride(model.encoder)
     shapes = choose_parts(shapes_of(model.encoder.state_dict()), parts)

@@ -428,13 +428,13 @@ def latest_checkpoint(
         CheckpointError: every checkpoint is damaged, or it belongs to another configuration, length or other frames.
     """
     latest = load_latest(folder.checkpoints)
-    if latest is None:
-        return None
-    if "imported" in latest.state:
+    if folder.is_imported() or (latest is not None and "imported" in latest.state):  # whatever of them is left
         raise CheckpointError(
-            f"{latest.path}: must be of a training, got imported weights; start one from them with --init_encoder "
+            f"{folder.path}: must be of a training, got imported weights; start one from them with --init_encoder "
             f"{folder.encoder}"
         )
+    if latest is None:
+        return None
     now, then = flatten(plain(config)), flatten(latest.state["config"])
     changed = sorted(key for key in now.keys() | then.keys() if now.get(key) != then.get(key) and key not in FREE_KEYS)
     if changed:

@@ -9,6 +9,7 @@ import json
 import multiprocessing
 import os
 import re
+import shutil
 import signal
 import time
 from collections import OrderedDict
@@ -212,18 +213,26 @@ def test_where_a_file_may_be_written(run: Path, tmp_path: Path, capsys: pytest.C
     """Said before any scan is read."""
     config = tiny_config(run)
     (tmp_path / "mine.pth.json").write_text('{"notes": "of the user"}')
+    files = list(run.rglob("*"))
+    before = {path: path.read_bytes() for path in files if path.is_file()}
+    assert {"config.yaml", "run.json", "encoder.pth"} <= {path.name for path in before}
     for out, text in (
         (tmp_path, "must be a file to write, got a folder"),
         (Path("."), "must be a file to write, got a folder"),
         (tmp_path / "none" / "a.pth", "none/a.pth: folder must exist, got none"),
-        (list_checkpoints(run / "checkpoints")[-1], "out must not replace what the run made"),
-        (run / "encoder.pth", "out must not replace what the run made"),
+        *((path, "out must not lie in the run folder") for path in files if path.is_file()),
+        (run / "new.pth", "out must not lie in the run folder"),
         (tmp_path / "mine.pth", r"mine\.pth\.json: must be absent or of `pred export`, got another file"),
     ):
         with pytest.raises((CheckpointError, ValueError), match=text):
             export(config, run, "openpcdet", out)
+    elsewhere = tmp_path / "elsewhere.pt"
+    shutil.copy(list_checkpoints(run / "checkpoints")[-1], elsewhere)
+    with pytest.raises(ValueError, match="out must not replace the checkpoint"):
+        export(config, run, "openpcdet", elsewhere, checkpoint=elsewhere)
     assert "recalibrating" not in capsys.readouterr().err
     assert (tmp_path / "mine.pth.json").read_text() == '{"notes": "of the user"}'
+    assert {path: path.read_bytes() for path in before} == before
 
 
 def test_a_full_disk_leaves_the_old_file_and_its_facts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -791,9 +800,13 @@ def test_commands_read_an_imported_run(run: Path, tmp_path: Path, capfd: pytest.
     assert cli.main(arguments) == 0
     assert "imported 24 tensors of openpcdet" in capfd.readouterr().out
     assert cli.main(["evaluate", "rendering", str(tmp_path / "imported"), "--frames", "1"]) == 0
-    # A training does not continue it, and says what does.
-    assert cli.main(["pretrain", "--resume", str(tmp_path / "imported")]) == 1
-    assert "start one from them with --init_encoder" in capfd.readouterr().err
+    assert json.loads((tmp_path / "imported/evaluation_rendering.json").read_text())["frames_trained_on"] is None
+    # A training does not continue it, and says what does; without its checkpoint it would start from nothing.
+    for _ in range(2):
+        assert cli.main(["pretrain", "--resume", str(tmp_path / "imported")]) == 1
+        assert "start one from them with --init_encoder" in capfd.readouterr().err
+        shutil.rmtree(tmp_path / "imported/checkpoints")
+        (tmp_path / "imported/checkpoints").mkdir()
 
 
 def refusal(tmp_path: Path, content: Any, message: str) -> None:
