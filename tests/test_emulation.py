@@ -53,5 +53,9 @@ def test_wrong_offsets_touch_no_memory_of_others(native: None, offsets: list[int
     torch.ops.pred.composite_alpha(sdf.sigmoid(), t, values, rays, 0.0, True)
     torch.ops.pred.composite_alpha_backward(*grads, sdf.sigmoid(), t, values, rays, 0.0, True, True, True, True)
     assert out[1].shape == (len(offsets) - 1,)
-    voxels = torch.ops.pred.voxelize(torch.rand(samples, 3), rays, [0.1] * 3, [0.0] * 3 + [1.0] * 3, [10] * 3)
+    points, grid = torch.rand(samples, 3), ([0.1] * 3, [0.0] * 3 + [1.0] * 3, [10] * 3)
+    voxels = torch.ops.pred.voxelize(points, rays, *grid)
     assert voxels[1].shape == (samples,) and voxels[2].sum() == samples
+    for most in (1, 100):  # per frame
+        table, _, counts, slots = torch.ops.pred.voxelize_hard(points, rays, *grid, samples, most)
+        assert table.shape[0] >= 1 and counts.sum() == (slots >= 0).sum()

@@ -8,31 +8,23 @@
 #include <tuple>
 #include <vector>
 
-#include "ops/voxelize_inputs.h"
-#ifndef PRED_LAUNCH
 #include "ops/voxelize_sort.h"
-#endif
 
 namespace pred {
 namespace {
 
 #ifdef PRED_LAUNCH
-PRED_KERNELS_BY_STORAGE(VoxelizeKernels, voxelize)
-
 template <typename S>
 std::tuple<Tensor, Tensor, Tensor> voxels(const VoxelizeInputs& in, const Tensor& point_to_voxel) {
   const VoxelizeKernels<S>& k = voxelize_kernels<S>();
-  const VoxelizePoints<S> a = in.arguments<S>();
-  const int64_t num_points = in.num_points();
+  const SortedTensor sorted = sort_by_voxel<S>(in);
   const Tensor workspace =
-      torch::stable::new_empty(point_to_voxel, {k.workspace_bytes(num_points, in.key_bits)}, ScalarType::Byte);
+      torch::stable::new_empty(point_to_voxel, {k.number_bytes(in.num_points())}, ScalarType::Byte);
   char* space = mutable_storage<char>(workspace);
-  const int64_t num_voxels = k.number(a, in.offsets.const_data_ptr<int64_t>(), in.num_frames(), num_points, in.key_bits,
-                                      point_to_voxel.mutable_data_ptr<int64_t>(), space);
+  const int64_t num_voxels = k.number(sorted.points, point_to_voxel.mutable_data_ptr<int64_t>(), space);
   Tensor coords = torch::stable::new_empty(point_to_voxel, {num_voxels, 4});
   Tensor counts = torch::stable::new_empty(point_to_voxel, {num_voxels});
-  k.write(a.bits, num_points, in.key_bits, coords.mutable_data_ptr<int64_t>(), counts.mutable_data_ptr<int64_t>(),
-          space);
+  k.write(sorted.points, in.bits, coords.mutable_data_ptr<int64_t>(), counts.mutable_data_ptr<int64_t>(), space);
   return {coords, point_to_voxel, counts};
 }
 #else

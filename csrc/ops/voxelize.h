@@ -71,16 +71,47 @@ PRED_HOST_DEVICE uint64_t voxel_key(const VoxelKeyBits& bits, int64_t frame, int
 }
 
 #ifdef PRED_LAUNCH
-// Keys, of at most 62 bits, stand apart from rows here.
+// Points by voxel, then by row. Keys, of at most 62 bits, stand apart from rows here; those of points outside have a
+// bit above these, key_bits, and so come last. `rows` are all the rows, whatever the points are.
+struct SortedPoints {
+  const uint64_t* keys;
+  const int32_t* rows;
+  int64_t count;
+  int key_bits;
+};
+
+PRED_HOST_DEVICE bool is_inside(const SortedPoints& points, int64_t i) {
+  return points.keys[i] >> points.key_bits == 0;
+}
+
+PRED_HOST_DEVICE bool starts_voxel(const SortedPoints& points, int64_t i) {
+  return is_inside(points, i) && starts_voxel(points.keys, 0, i);
+}
+
+// The first place behind i that is not of its voxel, or `limit`.
+PRED_HOST_DEVICE int64_t voxel_end(const SortedPoints& points, int64_t i, int64_t limit) {
+  int64_t end = i + 1;
+  while (end < limit) {
+    const int64_t middle = (end + limit) / 2;
+    if (points.keys[middle] == points.keys[i])
+      end = middle + 1;
+    else
+      limit = middle;
+  }
+  return end;
+}
+
 template <typename S>
 struct VoxelizeKernels {
-  int64_t (*workspace_bytes)(int64_t num_points, int key_bits);
-  // Sorts the points by voxel, numbers these, and returns how many there are; point_to_voxel gets the numbers.
-  int64_t (*number)(const VoxelizePoints<S>&, const int64_t* offsets, int64_t num_frames, int64_t num_points,
-                    int key_bits, int64_t* point_to_voxel, char* workspace);
+  int64_t (*sort_bytes)(int64_t num_points, int key_bits);
+  // The result lies in the workspace.
+  SortedPoints (*sort)(const VoxelizePoints<S>&, const int64_t* offsets, int64_t num_frames, int64_t num_points,
+                       int key_bits, char* workspace);
+  int64_t (*number_bytes)(int64_t num_points);
+  // Numbers the voxels and returns how many there are; point_to_voxel gets the numbers.
+  int64_t (*number)(const SortedPoints&, int64_t* point_to_voxel, char* workspace);
   // Writes them, from the same workspace.
-  void (*write)(const VoxelKeyBits&, int64_t num_points, int key_bits, int64_t* coords, int64_t* counts,
-                char* workspace);
+  void (*write)(const SortedPoints&, const VoxelKeyBits&, int64_t* coords, int64_t* counts, char* workspace);
 };
 #else
 template <typename S, typename Item>

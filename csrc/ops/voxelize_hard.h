@@ -16,6 +16,29 @@
 
 namespace pred {
 
+#ifdef PRED_LAUNCH
+template <typename S>
+struct VoxelizeHardArgs {
+  SortedPoints sorted;
+  VoxelKeyBits bits;
+  const S* points;              // [N, C], contiguous
+  int64_t columns, max_points;  // C, max_points
+};
+
+template <typename S>
+struct VoxelizeHardKernels {
+  int64_t (*workspace_bytes)(int64_t num_points);
+  // Numbers the voxels, at most max_voxels per frame, and returns how many there are. All points get slot -1.
+  int64_t (*number)(const SortedPoints&, const VoxelKeyBits&, const int64_t* offsets, int64_t max_voxels,
+                    int64_t* point_to_slot, char* workspace);
+  // Everything of them, from the same workspace, and the slots of the points kept in them.
+  void (*write)(const VoxelizeHardArgs<S>&, int64_t num_voxels, S* voxels, int64_t* coords, int64_t* counts,
+                int64_t* point_to_slot, char* workspace);
+  // A slot outside of [0, num_slots) counts as -1.
+  void (*backward)(const S* grad, int64_t num_slots, int64_t columns, const int64_t* point_to_slot, S* out,
+                   int64_t num_points);
+};
+#else
 template <typename S, typename Item>
 struct VoxelizeHardArgs {
   const Item* items;  // sorted
@@ -46,12 +69,20 @@ using VoxelizeHardBits16 = VoxelizeHardKernels<uint16_t, uint64_t>;
 using VoxelizeHardWideF32 = VoxelizeHardKernels<float, WideItem>;
 using VoxelizeHardWideF64 = VoxelizeHardKernels<double, WideItem>;
 using VoxelizeHardWideBits16 = VoxelizeHardKernels<uint16_t, WideItem>;
+#endif
 
 }  // namespace pred
 
+#ifdef PRED_LAUNCH
+PRED_DECLARE_KERNELS(VoxelizeHardKernels<float>, voxelize_hard_f32)
+PRED_DECLARE_KERNELS(VoxelizeHardKernels<double>, voxelize_hard_f64)
+PRED_DECLARE_KERNELS(VoxelizeHardKernels<BFloat16>, voxelize_hard_bf16)
+PRED_DECLARE_KERNELS(VoxelizeHardKernels<Float16>, voxelize_hard_f16)
+#else
 PRED_DECLARE_KERNELS(VoxelizeHardF32, voxelize_hard_f32)
 PRED_DECLARE_KERNELS(VoxelizeHardF64, voxelize_hard_f64)
 PRED_DECLARE_KERNELS(VoxelizeHardBits16, voxelize_hard_bits16)
 PRED_DECLARE_KERNELS(VoxelizeHardWideF32, voxelize_hard_wide_f32)
 PRED_DECLARE_KERNELS(VoxelizeHardWideF64, voxelize_hard_wide_f64)
 PRED_DECLARE_KERNELS(VoxelizeHardWideBits16, voxelize_hard_wide_bits16)
+#endif

@@ -1,8 +1,10 @@
 // Copyright 2026 The PRED authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Points sorted by voxel, in loops on the CPU, for voxelize and voxelize_hard.
+// Points sorted by voxel and then by row, for voxelize and voxelize_hard.
 #pragma once
+
+#include <torch/csrc/stable/ops.h>
 
 #include "common/parallel.h"
 #include "common/radix_sort.h"
@@ -10,6 +12,25 @@
 
 namespace pred {
 
+#ifdef PRED_LAUNCH
+PRED_KERNELS_BY_STORAGE(VoxelizeKernels, voxelize)
+
+// With the memory in which they lie.
+struct SortedTensor {
+  Tensor workspace;
+  SortedPoints points;
+};
+
+template <typename S>
+SortedTensor sort_by_voxel(const VoxelizeInputs& in) {
+  const VoxelizeKernels<S>& k = voxelize_kernels<S>();
+  const int64_t num_points = in.num_points();
+  const Tensor workspace =
+      torch::stable::new_empty(in.offsets, {k.sort_bytes(num_points, in.key_bits)}, ScalarType::Byte);
+  return {workspace, k.sort(in.arguments<S>(), in.offsets.const_data_ptr<int64_t>(), in.num_frames(), num_points,
+                            in.key_bits, mutable_storage<char>(workspace))};
+}
+#else
 template <typename S, typename Item>
 const VoxelizeKernels<S, Item>& voxelize_kernels() {
   constexpr bool wide = !std::is_same_v<Item, uint64_t>;
@@ -55,5 +76,6 @@ auto with_sorted_points(const VoxelizeInputs& in, int64_t* point_to_voxel, const
   if (in.key_bits + in.bits.row <= 64) return body(a, sort_by_voxel<S, uint64_t>(in, a, point_to_voxel));
   return body(a, sort_by_voxel<S, WideItem>(in, a, point_to_voxel));
 }
+#endif
 
 }  // namespace pred

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from benchmarks.cases import POINT_RANGE_M, lidar_points
 from pred.ops import HardVoxels, reference, voxelize_hard
-from tests.conftest import KERNEL_ERROR
+from tests.conftest import KERNEL_ERROR, LAUNCHED, require_value_checks
 
 RANGE = (-51.2, -51.2, -5.0, 51.2, 51.2, 3.0)
 SIZES = [(0.1, 0.1, 0.2), (0.2, 0.2, 8.0), (3.2, 1.6, 0.4)]
@@ -251,10 +251,18 @@ def test_errors(backend: str) -> None:
 def test_direct_calls_are_checked(native: None) -> None:
     points, size, bounds = cloud(10), list(SIZES[1]), list(RANGE)
     forward, backward = torch.ops.pred.voxelize_hard, torch.ops.pred.voxelize_hard_backward
+    with pytest.raises(KERNEL_ERROR, match="voxelize_hard: max_points must be at least 1, got 0"):
+        forward(points, torch.tensor([0, 10]), size, bounds, [512, 512, 1], 0, 1)
+    require_value_checks("native")
     for wrong in ([], [0], [1, 10], [0, 20, 10]):
         with pytest.raises(KERNEL_ERROR, match="voxelize_hard: batch_offsets must ascend from 0 to N=10"):
             forward(points, torch.tensor(wrong, dtype=torch.int64), size, bounds, [512, 512, 1], 1, 1)
-    with pytest.raises(KERNEL_ERROR, match="voxelize_hard: max_points must be at least 1, got 0"):
-        forward(points, torch.tensor([0, 10]), size, bounds, [512, 512, 1], 0, 1)
     with pytest.raises(KERNEL_ERROR, match="voxelize_hard_backward: point_to_slot must be less than 6, got 6"):
         backward(torch.zeros(2, 3, 5), torch.tensor([0, -1, 6]))
+
+
+@pytest.mark.skipif(not LAUNCHED, reason="slots are checked")
+def test_unchecked_slots_count_as_none(native: None) -> None:
+    grad = torch.rand(2, 3, 5)
+    out = torch.ops.pred.voxelize_hard_backward(grad, torch.tensor([4, 6, -1, -7, 2**62, -(2**62), 0]))
+    assert torch.equal(out, torch.cat([grad[1, 1:2], torch.zeros(5, 5), grad[0, :1]]))
