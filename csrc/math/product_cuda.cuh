@@ -237,15 +237,15 @@ PRED_DEVICE_ONLY void wait_for_copies() {
 // Sizes of a product. Inner: results [m, n] = sum over k of left[m, k] right[n, k], over `segments` pairs of factors.
 // Outer: results [m, n] = sum over rows k of left[k, m] right[k, n], where `splits` blocks share the rows of a
 // segment. Rows hold whole chunks, of which those of k (inner), of m and n (outer) are read.
-constexpr int kMostSparseSegments = 512;
-
 struct ProductSizes {
   int64_t m, n, k;
   int segments, splits;
 };
 
+constexpr int kMostSparseSegments = 512;
+
 // Left and Right: const S* row(int64_t i, int segment), null for a row of zeros. Left::kSparse: most rows are, and
-// segments of an inner product for which all of a tile's are, are left out, if there are not too many. The epilogue
+// segments for which all rows of a tile are, are left out, up to kMostSparseSegments of an inner product. The epilogue
 // gets (row, column, split, value, value of the next column), for rows below m and columns below n, from one thread
 // each.
 template <typename S, bool kOuter, class Left, class Right, class Epilogue>
