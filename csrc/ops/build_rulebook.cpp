@@ -22,32 +22,6 @@ namespace {
 
 constexpr int64_t kGrain = 1024, kMaxKeys = int64_t(1) << 62, kMaxRows = int64_t(1) << 31;
 
-// A hash table with the memory of its own.
-struct OwnedTable {
-  std::unique_ptr<int64_t[]> keys;
-  std::unique_ptr<int32_t[]> rows;
-  SiteTable table;
-
-  explicit OwnedTable(int64_t count) {
-    int bits = 4;
-    while (int64_t(1) << bits < 2 * count) ++bits;
-    const int64_t slots = int64_t(1) << bits;
-    keys = allocate_array<int64_t>(slots);
-    rows = allocate_array<int32_t>(slots);
-    std::fill_n(keys.get(), slots, int64_t(-1));
-    table = {keys.get(), rows.get(), bits};
-  }
-
-  // The row that had the key before, or -1.
-  int32_t insert(int64_t key, int32_t row) {
-    const uint64_t slot = slot_of(table, key);
-    if (table.keys[slot] == key) return table.rows[slot];
-    table.keys[slot] = key;
-    table.rows[slot] = row;
-    return -1;
-  }
-};
-
 RulebookArgs arguments(const char* op, const Tensor& indices, int64_t num_frames, const std::vector<int64_t>& shape,
                        const std::vector<int64_t>& kernel, const std::vector<int64_t>& stride,
                        const std::vector<int64_t>& padding, const std::vector<int64_t>& dilation, bool submanifold) {
@@ -91,6 +65,77 @@ RulebookArgs arguments(const char* op, const Tensor& indices, int64_t num_frames
   return a;
 }
 
+// Outputs that one input can feed at most, and the number of keys of outputs.
+struct OutputSizes {
+  int64_t most = 1, num_keys;
+
+  explicit OutputSizes(const RulebookArgs& a) : num_keys(std::max<int64_t>(1, a.num_frames)) {
+    for (int axis = 0; axis < 3; ++axis) {
+      const int64_t period = a.stride[axis] / std::gcd(a.stride[axis], a.dilation[axis]);
+      most *= (a.kernel[axis] + period - 1) / period;
+      num_keys *= a.out_shape[axis];
+    }
+  }
+};
+
+void check_outputs(const char* op, int64_t num_out, int64_t taps) {
+  PRED_CHECK(num_out < kMaxRows / taps, op, ": there must be fewer than 2^31 outputs x taps, got ", num_out, " x ",
+             taps);
+}
+
+using Outputs = std::tuple<Tensor, Tensor, Tensor>;
+
+#ifdef PRED_LAUNCH
+Outputs rulebook(const char* op, const RulebookArgs& a, const Tensor& indices, bool submanifold) {
+  const RulebookKernels& k = PRED_KERNELS(build_rulebook_all);
+  const int64_t taps = num_taps(a);
+  const auto new_table = [&](int64_t rows) { return torch::stable::new_empty(indices, {rows, taps}, ScalarType::Int); };
+  const auto bytes = [&](int64_t count) { return torch::stable::new_empty(indices, {count}, ScalarType::Byte); };
+  Tensor in_to_out = new_table(a.num_sites);
+  int32_t* in_data = in_to_out.mutable_data_ptr<int32_t>();
+  if (submanifold) {
+    Tensor out_to_in = new_table(a.num_sites);
+    const Tensor table = bytes(k.table_bytes(a.num_sites));
+    k.submanifold(a, out_to_in.mutable_data_ptr<int32_t>(), in_data, mutable_storage<char>(table));
+    return {torch::stable::clone(indices), out_to_in, in_to_out};
+  }
+  const OutputSizes sizes(a);
+  const Tensor workspace = bytes(k.outputs_bytes(a, sizes.most, sizes.num_keys));
+  const int64_t num_out = k.outputs(a, sizes.most, sizes.num_keys, mutable_storage<char>(workspace));
+  check_outputs(op, num_out, taps);
+  Tensor out_indices = torch::stable::new_empty(indices, {num_out, 4}), out_to_in = new_table(num_out);
+  const Tensor table = bytes(k.table_bytes(num_out));
+  k.strided(a, sizes.most, sizes.num_keys, num_out, out_indices.mutable_data_ptr<int64_t>(),
+            out_to_in.mutable_data_ptr<int32_t>(), in_data, mutable_storage<char>(workspace),
+            mutable_storage<char>(table));
+  return {out_indices, out_to_in, in_to_out};
+}
+#else
+// A hash table with the memory of its own.
+struct OwnedTable {
+  std::unique_ptr<int64_t[]> keys;
+  std::unique_ptr<int32_t[]> rows;
+  SiteTable table;
+
+  explicit OwnedTable(int64_t count) {
+    const int bits = table_bits(count);
+    const int64_t slots = int64_t(1) << bits;
+    keys = allocate_array<int64_t>(slots);
+    rows = allocate_array<int32_t>(slots);
+    std::fill_n(keys.get(), slots, int64_t(-1));
+    table = {keys.get(), rows.get(), bits};
+  }
+
+  // The row that had the key before, or -1.
+  int32_t insert(int64_t key, int32_t row) {
+    const uint64_t slot = slot_of(table, key);
+    if (table.keys[slot] == key) return table.rows[slot];
+    table.keys[slot] = key;
+    table.rows[slot] = row;
+    return -1;
+  }
+};
+
 void check_sites(const char* op, const RulebookArgs& a) {
   const RulebookKernels& k = PRED_KERNELS(build_rulebook_all);
   std::atomic<int64_t> first{a.num_sites};
@@ -119,13 +164,8 @@ void check_distinct(const char* op, const RulebookArgs& a, OwnedTable& table) {
 
 // The distinct keys of the outputs, ascending.
 std::vector<int64_t> output_keys(const RulebookArgs& a, const RulebookKernels& k) {
-  int64_t most = 1;  // outputs that one input can feed
-  int64_t num_keys = std::max<int64_t>(1, a.num_frames);
-  for (int axis = 0; axis < 3; ++axis) {
-    const int64_t period = a.stride[axis] / std::gcd(a.stride[axis], a.dilation[axis]);
-    most *= (a.kernel[axis] + period - 1) / period;
-    num_keys *= a.out_shape[axis];
-  }
+  const OutputSizes sizes(a);
+  const int64_t most = sizes.most, num_keys = sizes.num_keys;
   const auto fed = allocate_array<int64_t>(a.num_sites * most);
   parallel(a.num_sites, kGrain, [&](int64_t begin, int64_t end) { k.outputs(a, most, fed.get(), begin, end); });
   const auto sorted =
@@ -143,16 +183,7 @@ std::vector<int64_t> output_keys(const RulebookArgs& a, const RulebookKernels& k
   return keys;
 }
 
-std::tuple<Tensor, Tensor, Tensor> build_rulebook(const Tensor& indices_in, int64_t batch_size,
-                                                  std::vector<int64_t> spatial_shape, std::vector<int64_t> kernel_size,
-                                                  std::vector<int64_t> stride, std::vector<int64_t> padding,
-                                                  std::vector<int64_t> dilation, bool submanifold) {
-  const char* op = "build_rulebook";
-  check_tensor(op, "indices", indices_in, 2, ScalarType::Long);
-  PRED_CHECK(indices_in.size(1) == 4, op, ": indices must have shape [M, 4], got ", shape_text(indices_in));
-  const Tensor indices = torch::stable::contiguous(indices_in);
-  const RulebookArgs a =
-      arguments(op, indices, batch_size, spatial_shape, kernel_size, stride, padding, dilation, submanifold);
+Outputs rulebook(const char* op, const RulebookArgs& a, const Tensor& indices, bool submanifold) {
   check_sites(op, a);
   const RulebookKernels& k = PRED_KERNELS(build_rulebook_all);
   OwnedTable inputs(a.num_sites);
@@ -176,8 +207,7 @@ std::tuple<Tensor, Tensor, Tensor> build_rulebook(const Tensor& indices_in, int6
 
   const std::vector<int64_t> keys = output_keys(a, k);
   const int64_t num_out = int64_t(keys.size());
-  PRED_CHECK(num_out < kMaxRows / taps, op, ": there must be fewer than 2^31 outputs x taps, got ", num_out, " x ",
-             taps);
+  check_outputs(op, num_out, taps);
   OwnedTable outputs(num_out);
   Tensor out_indices = torch::stable::new_empty(indices, {num_out, 4});
   int64_t* site = out_indices.mutable_data_ptr<int64_t>();
@@ -196,8 +226,21 @@ std::tuple<Tensor, Tensor, Tensor> build_rulebook(const Tensor& indices_in, int6
            [&](int64_t begin, int64_t end) { k.strided(a, outputs.table, out_data, in_data, begin, end); });
   return {out_indices, out_to_in, in_to_out};
 }
+#endif
+
+Outputs build_rulebook(const Tensor& indices_in, int64_t batch_size, std::vector<int64_t> spatial_shape,
+                       std::vector<int64_t> kernel_size, std::vector<int64_t> stride, std::vector<int64_t> padding,
+                       std::vector<int64_t> dilation, bool submanifold) {
+  const char* op = "build_rulebook";
+  check_tensor(op, "indices", indices_in, 2, ScalarType::Long);
+  PRED_CHECK(indices_in.size(1) == 4, op, ": indices must have shape [M, 4], got ", shape_text(indices_in));
+  const Tensor indices = torch::stable::contiguous(indices_in);
+  const RulebookArgs a =
+      arguments(op, indices, batch_size, spatial_shape, kernel_size, stride, padding, dilation, submanifold);
+  return rulebook(op, a, indices, submanifold);
+}
 
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) { m.impl("build_rulebook", TORCH_BOX(&pred::build_rulebook)); }
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) { PRED_IMPL(m, "build_rulebook", &pred::build_rulebook); }

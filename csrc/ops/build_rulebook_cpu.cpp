@@ -10,10 +10,7 @@ namespace {
 
 static int64_t find_outside(const RulebookArgs& a, int64_t begin, int64_t end) {
   for (int64_t i = begin; i < end; ++i) {
-    const int64_t* site = a.indices + 4 * i;
-    bool inside = site[0] >= 0 && site[0] < a.num_frames;
-    for (int axis = 0; axis < 3; ++axis) inside &= site[axis + 1] >= 0 && site[axis + 1] < a.in_shape[axis];
-    if (!inside) return i;
+    if (!is_inside(a, a.indices + 4 * i)) return i;
   }
   return -1;
 }
@@ -22,26 +19,6 @@ static void keys(const RulebookArgs& a, int64_t* keys, int64_t begin, int64_t en
   for (int64_t i = begin; i < end; ++i) {
     const int64_t* site = a.indices + 4 * i;
     keys[i] = site_key(a.in_shape, site[0], site[1], site[2], site[3]);
-  }
-}
-
-// body(tap, key of the output) for every output that a site feeds.
-template <class Body>
-static inline void for_each_output(const RulebookArgs& a, const int64_t* site, const Body& body) {
-  int64_t tap = 0;
-  for (int64_t kz = 0; kz < a.kernel[0]; ++kz) {
-    const int64_t z = fed_output(a, 0, site[1], kz);
-    for (int64_t ky = 0; ky < a.kernel[1]; ++ky) {
-      const int64_t y = z < 0 ? -1 : fed_output(a, 1, site[2], ky);
-      if (y < 0) {
-        tap += a.kernel[2];
-        continue;
-      }
-      for (int64_t kx = 0; kx < a.kernel[2]; ++kx, ++tap) {
-        const int64_t x = fed_output(a, 2, site[3], kx);
-        if (x >= 0) body(tap, site_key(a.out_shape, site[0], z, y, x));
-      }
-    }
   }
 }
 

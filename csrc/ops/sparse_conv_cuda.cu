@@ -30,7 +30,6 @@ struct TableRows {
 // Matrices [taps, outputs, stride] side by side.
 template <typename F>
 struct TapRows {
-  static constexpr bool kSparse = false;
   const F* data;
   int64_t stride, outputs;
 

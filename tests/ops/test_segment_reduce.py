@@ -250,6 +250,7 @@ except MemoryError:
 """
 
 
+@pytest.mark.skipif(LAUNCHED, reason="kernels that are launched have their scratch from torch")
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not tell the process's size")
 def test_scratch_that_does_not_fit(native: None) -> None:
     """The 2^31 bfloat16 of the result fit, their 8 GiB of float32 sums do not. In a process of its own, since malloc

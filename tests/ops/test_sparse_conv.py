@@ -306,14 +306,6 @@ def test_int32_indices_and_large_grids(backend: str) -> None:
     [
         ({"indices": torch.zeros(3, 3, dtype=torch.int64)}, ValueError, r"indices must have shape \[M, 4\]"),
         ({"indices": torch.zeros(3, 4)}, TypeError, "indices must be int32 or int64"),
-        ({"indices": torch.tensor([[0, 0, 0, 0], [2, 0, 0, 0]])}, ValueError, r"indices must lie inside .* in row 1"),
-        ({"indices": torch.tensor([[0, 0, 0, 0], [0, 4, 0, 0]])}, ValueError, r"got \[0, 4, 0, 0\] in row 1"),
-        ({"indices": torch.tensor([[0, -1, 0, 0]])}, ValueError, r"got \[0, -1, 0, 0\] in row 0"),
-        (
-            {"indices": torch.tensor([[0, 1, 1, 1], [1, 1, 1, 1], [0, 1, 1, 1]])},
-            ValueError,
-            "indices must be distinct, got one site in rows 0 and 2",
-        ),
         ({"spatial_shape": (4, 5)}, ValueError, "spatial_shape must hold 3 numbers"),
         ({"spatial_shape": (4, 0, 6)}, ValueError, "spatial_shape must be at least 1, got 0"),
         ({"spatial_shape": (2**30, 2**30, 2**30)}, ValueError, r"at most 2\^62 sites"),
@@ -334,6 +326,21 @@ def test_wrong_rulebook_arguments(backend: str, change: dict[str, Any], error: t
     } | change
     with pytest.raises(error, match=f"^build_rulebook: .*{text}"):
         build_rulebook(**arguments)
+
+
+@pytest.mark.parametrize(
+    "indices,text",
+    [
+        ([[0, 0, 0, 0], [2, 0, 0, 0]], "indices must lie inside .* in row 1"),
+        ([[0, 0, 0, 0], [0, 4, 0, 0]], r"indices must lie inside .*got \[0, 4, 0, 0\] in row 1"),
+        ([[0, -1, 0, 0]], r"indices must lie inside .*got \[0, -1, 0, 0\] in row 0"),
+        ([[0, 1, 1, 1], [1, 1, 1, 1], [0, 1, 1, 1]], "indices must be distinct, got one site in rows 0 and 2"),
+    ],
+)
+def test_wrong_sites(backend: str, indices: list[list[int]], text: str) -> None:
+    require_value_checks(backend)
+    with pytest.raises(ValueError, match=f"^build_rulebook: {text}"):
+        build_rulebook(torch.tensor(indices), 2, (4, 5, 6), 3)
 
 
 def rulebook_of(count: int) -> Rulebook:
@@ -374,10 +381,6 @@ def test_direct_calls_are_checked(native: None) -> None:
     features, weight = torch.zeros(2, 4), torch.zeros(3, 3, 4)
     with pytest.raises(KERNEL_ERROR, match="build_rulebook: indices must have dtype Long, got Int"):
         call.build_rulebook(line.int(), 1, *sizes, True)
-    with pytest.raises(KERNEL_ERROR, match=r"indices must lie inside batch_size 1 .* got \[0, 0, 0, 5\] in row 0"):
-        call.build_rulebook(line + torch.tensor([0, 0, 0, 5]), 1, *sizes, True)
-    with pytest.raises(KERNEL_ERROR, match="indices must be distinct, got one site in rows 0 and 1"):
-        call.build_rulebook(0 * line, 1, *sizes, True)
     with pytest.raises(KERNEL_ERROR, match=r"padding must be .* got 2 and 1 for a kernel_size of 3"):
         call.build_rulebook(line, 1, *sizes[:3], [0, 0, 2], [1, 1, 1], True)
     with pytest.raises(KERNEL_ERROR, match=r"spatial_shape must give at most 2\^62 sites .* got \[1073741824, "):
@@ -393,8 +396,25 @@ def test_direct_calls_are_checked(native: None) -> None:
     with pytest.raises(KERNEL_ERROR, match=r"sparse_max_pool_backward: winner must have shape \[2, 4\], got \[3, 4\]"):
         call.sparse_max_pool_backward(features, torch.zeros(3, 4, dtype=torch.int32), table)
     require_value_checks("native")
+    with pytest.raises(KERNEL_ERROR, match=r"indices must lie inside batch_size 1 .* got \[0, 0, 0, 5\] in row 0"):
+        call.build_rulebook(line + torch.tensor([0, 0, 0, 5]), 1, *sizes, True)
+    with pytest.raises(KERNEL_ERROR, match="indices must be distinct, got one site in rows 0 and 1"):
+        call.build_rulebook(0 * line, 1, *sizes, True)
     with pytest.raises(KERNEL_ERROR, match=r"sparse_conv: out_to_in must lie in \[-1, 2\), got 2 in row 0"):
         call.sparse_conv(features, weight, None, table + (table == 1), table)
+
+
+@pytest.mark.skipif(not LAUNCHED, reason="sites are checked")
+@pytest.mark.parametrize("submanifold", [False, True])
+def test_unchecked_sites_outside_feed_nothing(native: None, submanifold: bool) -> None:
+    far = torch.tensor([[0, 0, 0, 9], [-1, 0, 0, 0], [1, 0, 0, 0], [0, 2**62, 0, 1], [0, 0, -(2**62), 1]])
+    near, sizes = sites(7, 1, (4, 5, 6)), ([4, 5, 6], [3, 3, 3], [1, 1, 1], [1, 1, 1], [1, 1, 1])
+    call = torch.ops.pred.build_rulebook
+    expected = call(near, 1, *sizes, submanifold)
+    found = call(torch.cat([near, far]), 1, *sizes, submanifold)
+    assert torch.equal(found[2][:7], expected[2]) and (found[2][7:] == -1).all()
+    assert torch.equal(found[1][: len(expected[1])], expected[1]) and (found[1][len(expected[1]) :] == -1).all()
+    call(near[:1].expand(5, 4).contiguous(), 1, *sizes, submanifold)  # one site many times
 
 
 @pytest.mark.skipif(not LAUNCHED, reason="the tables are checked")
