@@ -16,8 +16,9 @@ import hashlib
 import json
 import os
 import re
+import reprlib
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -112,6 +113,9 @@ def encoder_facts(
         trained_with: versions of the training; None: those of this process.
         imported: where the weights come from if this package did not train them (`load_encoder`). What that file does
             not say of its training is None.
+
+    Raises:
+        CheckpointError: facts of the imported file are malformed.
     """
     data = config.data
     training: dict[str, Any] = {
@@ -125,7 +129,8 @@ def encoder_facts(
         "trained_with": dict(environment()["versions"] if trained_with is None else trained_with),
     }
     if imported is not None:
-        training = {name: imported["facts"].get(name) for name in training}
+        said = _checked_facts(imported["file"], imported["facts"])
+        training = {name: said.get(name) for name in training}
         training["imported"] = dict(imported)
     return {
         "encoder": type(encoder).__name__,
@@ -298,14 +303,15 @@ def read_weights(path: Path) -> WeightsFile:
     """The weights in a checkpoint: under ``model_state``, under ``state_dict``, or a flat dictionary.
 
     Raises:
-        CheckpointError: the file cannot be read, holds no weights, or is not the one that its sidecar describes.
+        CheckpointError: the file cannot be read, holds no weights or malformed facts, or is not the one that its
+            sidecar describes.
     """
     content = load_tensors(path)
     if sidecar(path).is_file():
         _require_sidecar(path)
     for key in ("model_state", "state_dict"):
         if isinstance(content.get(key), dict):
-            state = content[key]
+            state, facts = content[key], content.get(FACTS, {})
             break
     else:
         if not content or not all(isinstance(value, Tensor) for value in content.values()):
@@ -318,7 +324,7 @@ def read_weights(path: Path) -> WeightsFile:
                 f"{path}: must hold weights under model_state or state_dict, or be a dictionary of tensors, got the "
                 f"keys {', '.join(map(str, content)) or 'none'}{hint}"
             )
-        state = content
+        state, facts = content, {}
     if not state:
         raise CheckpointError(f"{path}: must hold weights, got none")
     for name, value in state.items():
@@ -329,8 +335,86 @@ def read_weights(path: Path) -> WeightsFile:
         if value.layout != torch.strided or value.is_meta or value.is_quantized:
             kind = "quantized" if value.is_quantized else "meta" if value.is_meta else str(value.layout)
             raise CheckpointError(f"{path}: weights must be dense tensors with values, got a {kind} one as {name}")
-    facts = content.get(FACTS)
-    return WeightsFile(path, dict(state), facts if isinstance(facts, dict) else {})
+    return WeightsFile(path, dict(state), _checked_facts(path, facts))
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_whole(value: Any) -> bool:
+    return type(value) is int  # bool is a kind of int
+
+
+def _are_numbers(value: Any, count: int) -> bool:
+    if not isinstance(value, list) or len(value) != count:
+        return False
+    return all(type(number) in (int, float) and abs(number) < float("inf") for number in value)
+
+
+def _is_dictionary(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+_FACT_RULES: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "layout": ("a dictionary", _is_dictionary),
+    "layout.framework": (f"{', '.join(FRAMEWORKS[:-1])} or {FRAMEWORKS[-1]}", lambda value: value in FRAMEWORKS),
+    "voxel_size_m": ("a list of 3 numbers", lambda value: _are_numbers(value, 3)),
+    "point_range_m": ("a list of 6 numbers", lambda value: _are_numbers(value, 6)),
+    "point_channels": (
+        "a dictionary of names to units",
+        lambda value: isinstance(value, dict) and all(map(_is_text, value.values())),
+    ),
+    "time_unit": ("text", _is_text),
+    "batch_norm": ("a dictionary", _is_dictionary),
+}
+"""What the facts that are read must be, if they are there."""
+
+_TRAINING_RULES: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "dataset": ("text", _is_text),
+    "split": ("text", _is_text),
+    "sweeps": ("a whole number", _is_whole),
+    "mask_ratio": ("a number from 0 to 1", lambda value: type(value) in (int, float) and 0 <= value <= 1),
+    "mask_strategy": ("text", _is_text),
+    "step": ("a whole number", _is_whole),
+    "seed": ("a whole number", _is_whole),
+    "trained_with": ("a dictionary", _is_dictionary),
+}
+"""The same of those that may be None: nobody knows."""
+
+
+def _checked_facts(path: Path | str, facts: Any) -> dict[str, Any]:
+    """The facts of a file, which anybody may have written. Those that are not read must be plain values, as they are
+    handed on into run.json."""
+    if not isinstance(facts, dict):
+        raise CheckpointError(f"{path}: {FACTS} must be a dictionary, got {reprlib.repr(facts)}")
+    for name, value in facts.items():
+        if not isinstance(name, str):
+            raise CheckpointError(f"{path}: names of {FACTS} must be text, got {name!r}")
+        try:
+            _require_plain(path, name, value)
+        except RecursionError:
+            raise CheckpointError(f"{path}: {name} must hold plain values, got one within itself") from None
+    layout = facts.get("layout")
+    values = facts | ({"layout.framework": layout.get("framework")} if isinstance(layout, dict) else {})
+    for name, (rule, holds) in (_FACT_RULES | _TRAINING_RULES).items():
+        unsaid = name not in values or name in _TRAINING_RULES and values[name] is None
+        if not unsaid and not holds(values[name]):
+            raise CheckpointError(f"{path}: {name} must be {rule}, got {reprlib.repr(values[name])}")
+    return facts
+
+
+def _require_plain(path: Path | str, name: str, value: Any) -> None:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise CheckpointError(f"{path}: names in {name} must be text, got {key!r}")
+            _require_plain(path, f"{name}.{key}", item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            _require_plain(path, name, item)
+    elif value is not None and type(value) not in (bool, int, float, str):
+        raise CheckpointError(f"{path}: {name} must be a plain value, got {type(value).__name__}")
 
 
 def load_encoder(
@@ -357,13 +441,13 @@ def load_encoder(
         stand in the file.
 
     Raises:
-        CheckpointError: the file cannot be read, its encoder is not this one, or it says otherwise than the arguments;
-            the text names each difference and its probable cause.
+        CheckpointError: the file cannot be read, its facts are malformed, its encoder is not this one, or it says
+            otherwise than the arguments; the text names each difference and its probable cause.
     """
     file = read_weights(path)
     written = file.facts.get("layout")
     framework: Framework = "mmdet3d" if framework_of(file.state) == "mmdetection3d" else "openpcdet"
-    if isinstance(written, dict) and written.get("framework") in FRAMEWORKS:
+    if written is not None:
         if kernel_order == "krsc":
             raise CheckpointError(f"{path}: --kernel-order must be dhwio, as the file says, got krsc")
         kernel_order = "dhwio"
@@ -429,7 +513,7 @@ def _require_same_input(path: Path, facts: Mapping[str, Any], here: Mapping[str,
             )
     there = facts.get("point_range_m")
     z = [here["point_range_m"][axis] for axis in (2, 5)]
-    if isinstance(there, list) and len(there) == 6 and not _alike([there[2], there[5]], z):
+    if there is not None and not _alike([there[2], there[5]], z):
         raise CheckpointError(
             f"{path}: point_range_m must be that of the encoder in z, {z}, got {[there[2], there[5]]}"
         )

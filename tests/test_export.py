@@ -720,6 +720,75 @@ def test_what_a_file_says_of_itself(run: Path, tmp_path: Path, options: Any, ask
         load_encoder(encoder, tmp_path / "b.pth", LayoutOptions(**asked))
 
 
+def circular() -> list[Any]:
+    values: list[Any] = []
+    values.append(values)
+    return values
+
+
+MALFORMED: list[tuple[Any, Any, str]] = [
+    ("layout", "openpcdet", "layout must be a dictionary, got 'openpcdet'"),
+    ("layout", None, "layout must be a dictionary, got None"),
+    ("layout", {}, "layout.framework must be openpcdet, dsvt or mmdet3d, got None"),
+    ("layout", {"framework": ["dsvt"]}, "layout.framework must be openpcdet, dsvt or mmdet3d, got ['dsvt']"),
+    ("layout", {"framework": "dsvt", "options": 3}, "layout.options must be a dictionary, got int"),
+    ("voxel_size_m", 0.8, "voxel_size_m must be a list of 3 numbers, got 0.8"),
+    ("voxel_size_m", [0.8, 0.8, True], "voxel_size_m must be a list of 3 numbers, got [0.8, 0.8, True]"),
+    ("point_range_m", "all", "point_range_m must be a list of 6 numbers, got 'all'"),
+    ("point_range_m", [-3.0, 3.0], "point_range_m must be a list of 6 numbers, got [-3.0, 3.0]"),
+    ("point_range_m", [0, 0, "-3", 1, 1, 3], "point_range_m must be a list of 6 numbers, got [0, 0, '-3', 1, 1, 3]"),
+    ("point_range_m", [float("nan")] * 6, "point_range_m must be a list of 6 numbers, got [nan, "),
+    ("point_range_m", torch.zeros(6), "point_range_m must be a plain value, got Tensor"),
+    ("point_channels", ["x_m"], "point_channels must be a dictionary of names to units, got ['x_m']"),
+    ("point_channels", {1: "metres"}, "names in point_channels must be text, got 1"),
+    ("point_channels", {"x_m": 1}, "point_channels must be a dictionary of names to units, got {'x_m': 1}"),
+    ("time_unit", 1, "time_unit must be text, got 1"),
+    ("batch_norm", "masked", "batch_norm must be a dictionary, got 'masked'"),
+    ("dataset", 3, "dataset must be text, got 3"),
+    ("split", ["train"], "split must be text, got ['train']"),
+    ("mask_strategy", 1, "mask_strategy must be text, got 1"),
+    ("sweeps", 1.5, "sweeps must be a whole number, got 1.5"),
+    ("step", True, "step must be a whole number, got True"),
+    ("seed", "0", "seed must be a whole number, got '0'"),
+    ("mask_ratio", "0.95", "mask_ratio must be a number from 0 to 1, got '0.95'"),
+    ("mask_ratio", 95, "mask_ratio must be a number from 0 to 1, got 95"),
+    ("trained_with", [], "trained_with must be a dictionary, got []"),
+    ("notes", {"a": torch.Size([3]), "b": torch.zeros(2)}, "notes.b must be a plain value, got Tensor"),
+    ("notes", circular(), "notes must hold plain values, got one within itself"),
+    ("notes", {(1, 2): 3}, "names in notes must be text, got (1, 2)"),
+    (3, 4, "names of pred must be text, got 3"),
+]
+
+
+@pytest.mark.parametrize("name,value,text", MALFORMED)
+def test_malformed_facts_are_named(run: Path, tmp_path: Path, name: Any, value: Any, text: str) -> None:
+    weights = torch.load(run / "encoder.pth", weights_only=True)
+    weights["pred"][name] = value
+    path, config = tmp_path / "bad.pth", tiny_config(run)
+    torch.save(weights, path)
+    with pytest.raises(CheckpointError, match=re.escape(f"{path}: {text}")):
+        import_encoder(config, path, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    if "options" not in text:
+        imported = {"file": str(path), "facts": weights["pred"]}
+        with pytest.raises(CheckpointError, match=re.escape(f"{path}: {text}")):
+            encoder_facts(config, build_model(config).encoder, 0, {}, imported=imported)
+
+
+def test_facts_are_a_dictionary_or_absent(run: Path, tmp_path: Path) -> None:
+    path, state = tmp_path / "a.pth", trained_encoder(run)
+    torch.save({"model_state": state, "pred": ["a"]}, path)
+    with pytest.raises(CheckpointError, match=re.escape(f"{path}: pred must be a dictionary, got ['a']")):
+        read_weights(path)
+    torch.save({"model_state": state}, path)
+    assert read_weights(path).facts == {}
+    torch.save({"pred": torch.zeros(2)}, path)  # a flat file's tensor of that name says nothing
+    assert read_weights(path).facts == {} and read_weights(path).state.keys() == {"pred"}
+    # What nobody knows of a training is None.
+    torch.save({"model_state": state, "pred": dict.fromkeys(("dataset", "mask_ratio", "step", "trained_with"))}, path)
+    assert import_encoder(tiny_config(run), path, tmp_path / "out")["facts"]["step"] is None
+
+
 def test_an_option_beside_what_the_file_says(run: Path, tmp_path: Path) -> None:
     """Of what both say nothing is lost: the deblocks come back to the bit."""
     options = LayoutOptions(dynamic_pillars=True)
