@@ -9,7 +9,10 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
+from benchmarks.bench_step import VARIANTS, Step
+from benchmarks.cases import TINY
 from pred import _native, ops
+from pred.models.field import FieldDecoder
 from tests.ops.examples import EXAMPLES, Arguments, Example, evaluate, order_of
 from tests.tolerances import FORWARD, GRADIENT, assert_close
 
@@ -109,6 +112,31 @@ def test_rendering_is_captured_in_a_graph(native: None) -> None:
             leaf.mul_(0.9)
     graph.replay()
     for actual, expected in zip(captured, step(), strict=True):
+        assert torch.equal(actual, expected)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_a_step_is_captured_in_a_graph(native: None, name: str) -> None:
+    """The whole of it: coarse pass, resampling, decoding, compositing, losses and their gradients."""
+    step = Step(TINY, FieldDecoder, torch.device("cuda"), **VARIANTS[name])
+
+    def results() -> tuple[Tensor, ...]:
+        loss = step.loss()
+        return (loss.detach(), *torch.autograd.grad(loss, step.leaves))
+
+    side = torch.cuda.Stream()
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            results()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = results()
+    with torch.no_grad():
+        for leaf in step.leaves:
+            leaf.mul_(0.9)
+    graph.replay()
+    for actual, expected in zip(captured, results(), strict=True):
         assert torch.equal(actual, expected)
 
 

@@ -178,7 +178,7 @@ class Pretrainer(nn.Module):
         count = hit.sum()
         totals["num_rays"] += count
         num_frames, num_rays = hit.shape
-        step = self.renderer.rays_per_part
+        step = self.renderer.rays_per_part(hit.device)
         for frame in range(num_frames):
             for start in range(0, num_rays, step):
                 part = (slice(frame, frame + 1), slice(start, start + step))

@@ -10,6 +10,7 @@ B frames, R rays per frame, S samples per ray, K classes.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -42,15 +43,16 @@ class RendererConfig:
     """Depth of a sample's weight: the sample itself (paper) or the middle of its interval."""
     normalize_depth: bool = False
     """Divide the rendered depth by the ray's opacity (not in the paper)."""
-    samples_per_part: int = 16384
-    """Training renders about so many samples at a time: bounds the memory, changes nothing else."""
+    samples_per_part: int | None = None
+    """Training renders about so many samples at a time: bounds the memory, changes nothing else. None: 16384 on the
+    CPU, 262144 on a GPU, which fewer would not keep busy."""
 
     def __post_init__(self) -> None:
         if self.coarse_samples < 2:
             raise ValueError(f"RendererConfig: coarse_samples must be at least 2, got {self.coarse_samples}")
         if self.fine_samples < 0:
             raise ValueError(f"RendererConfig: fine_samples must not be negative, got {self.fine_samples}")
-        if self.samples_per_part < 1:
+        if self.samples_per_part is not None and self.samples_per_part < 1:
             raise ValueError(f"RendererConfig: samples_per_part must be at least 1, got {self.samples_per_part}")
         if not self.near_m >= 0:
             raise ValueError(f"RendererConfig: near_m must not be negative, got {self.near_m}")
@@ -115,11 +117,11 @@ class Renderer:
         self.config = config
         self.point_range = point_range
 
-    @property
-    def rays_per_part(self) -> int:
+    def rays_per_part(self, device: torch.device) -> int:
         """Rays that have about `samples_per_part` samples."""
         samples_per_ray = self.config.coarse_samples + self.config.fine_samples
-        return max(1, self.config.samples_per_part // samples_per_ray)
+        samples = self.config.samples_per_part or (16384 if device.type == "cpu" else 262144)
+        return max(1, samples // samples_per_ray)
 
     def hits(
         self,
@@ -154,9 +156,11 @@ class Renderer:
         t_near, t_far, crosses = ray_box_interval(origins, directions, self.point_range, self.config.near_m)
         hit = valid & crosses
         # A ray that does not count is replaced by a harmless one, so that no NaN enters the field.
-        low, high = origins.new_tensor(self.point_range).view(2, 3)
+        low, high = _box(self.point_range, origins)
+        ahead = torch.zeros_like(directions)
+        ahead[..., 0] = 1
         origins = torch.where(hit[..., None], origins, (low + high) / 2)
-        directions = torch.where(hit[..., None], directions, directions.new_tensor((1.0, 0.0, 0.0)))
+        directions = torch.where(hit[..., None], directions, ahead)
         jitter = torch.where(hit, jitter, 0.5)
 
         t = stratified_samples(t_near, t_far, jitter, self.config.coarse_samples)
@@ -233,7 +237,7 @@ def ray_box_interval(
         valid `[...]` bool. A ray that misses the box, ends before `near_m` or is not finite has
         valid False and the finite interval [near_m, near_m + 1].
     """
-    low, high = origins.new_tensor(point_range).view(2, 3)
+    low, high = _box(point_range, origins)
     to_low = (low - origins) / directions
     to_high = (high - origins) / directions
     # 0 / 0, a ray within a face's plane, is NaN and makes the ray miss, like any other NaN.
@@ -257,6 +261,12 @@ def stratified_samples(
     stratum = torch.arange(num_samples, dtype=t_near.dtype, device=t_near.device)
     share = (stratum + jitter[..., None]) / num_samples
     return t_near[..., None] + (t_far - t_near)[..., None] * share
+
+
+def _box(point_range: Sequence[float], like: Tensor) -> tuple[Tensor, Tensor]:
+    """Lowest and highest corner `[3]`, made where `like` is: a copy from the host would not go into a CUDA graph."""
+    corners = torch.stack([like.new_full((), bound) for bound in point_range])
+    return corners[:3], corners[3:]
 
 
 def _points_on_rays(

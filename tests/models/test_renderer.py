@@ -11,7 +11,10 @@ import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
+from benchmarks.bench_step import Step
+from benchmarks.cases import TINY
 from pred.models.field import FieldConfig, FieldDecoder
 from pred.models.renderer import (
     RaySamples,
@@ -246,3 +249,32 @@ def test_sampling_is_constant_and_rendering_is_not() -> None:
 def test_bad_configuration(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RendererConfig(**changes)
+
+
+class NoHost(TorchDispatchMode):
+    """Refuses to read a tensor's number."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        assert func is not torch.ops.aten._local_scalar_dense.default, "a number is read from a tensor"
+        return func(*args, **(kwargs or {}))
+
+
+def test_a_step_needs_nothing_from_the_host(native: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a CUDA graph cannot hold: tensors made of the host's numbers, and numbers read from tensors."""
+    step = Step(TINY, FieldDecoder)
+
+    def refuse(*_: Any, **__: Any) -> Tensor:
+        raise AssertionError("a tensor is made of the host's numbers")
+
+    with monkeypatch.context() as patched, NoHost():
+        patched.setattr(torch, "tensor", refuse)
+        patched.setattr(Tensor, "new_tensor", refuse)
+        gradients = torch.autograd.grad(step.loss(), step.leaves)
+    assert all(gradient.isfinite().all() for gradient in gradients)
+
+
+def test_rays_of_a_part_depend_on_the_device() -> None:
+    renderer = Renderer(RendererConfig(coarse_samples=96, fine_samples=128), RANGE)
+    assert renderer.rays_per_part(torch.device("cpu")) == 73 and renderer.rays_per_part(torch.device("cuda")) == 1170
+    renderer = Renderer(RendererConfig(coarse_samples=96, fine_samples=128, samples_per_part=1000), RANGE)
+    assert renderer.rays_per_part(torch.device("cpu")) == renderer.rays_per_part(torch.device("cuda")) == 4
