@@ -7,6 +7,7 @@
 #   make emulate   the tests of ops with CUDA kernels, on those kernels run by the CPU under the sanitizers
 #   make cuda-compile  the CUDA library for all architectures, compiled and linked (needs nvcc, no GPU)
 #   make test-cuda the same tests on a GPU, then compute-sanitizer on some (uses $(PYTHON) and its torch)
+#   make bench-cuda the benchmark suite on a GPU: records BENCH_OUT-step.json and BENCH_OUT-ops.json
 #   make fuzz      random arguments for every op under the sanitizers, for MINUTES
 #   make wheel-check  the op tests of one wheel under other versions of torch (downloads gigabytes)
 #   make lint      ruff, clang-format, mypy
@@ -22,6 +23,7 @@ RUN ?= runs/demo
 WORLD ?= runs/demo_world
 MINUTES ?= 60
 SEED ?= 0
+BENCH_OUT ?= benchmarks/results/gpu
 # What wheel-check runs under: version of torch (or newest), colon, Python. One that is missing is an error.
 WHEEL_PYTHON ?= python3.12
 WHEEL_CHECKS ?= 2.11.0:$(WHEEL_PYTHON) newest:$(WHEEL_PYTHON)
@@ -32,7 +34,7 @@ NATIVE := $(shell find csrc -type f) CMakeLists.txt setup.py
 # What nuscenes-devkit imports when its tables, maps and geometry are used; its numpy<2 pin is left aside.
 DEVKIT := cachetools descartes matplotlib opencv-python-headless pyquaternion scikit-learn shapely tqdm
 
-.PHONY: demo test sanitized sanitize emulate cuda-compile test-cuda fuzz wheel-check lint format docs bench clean
+.PHONY: demo test sanitized sanitize emulate cuda-compile cuda-build test-cuda bench-cuda fuzz wheel-check lint format docs bench clean
 .DELETE_ON_ERROR:
 
 $(VENV)/torch-$(TORCH).stamp:
@@ -101,15 +103,23 @@ cuda-compile: $(VENV)/dev.stamp
 	$(BIN)/cmake --build build/cuda --target pred_cuda
 	PRED_TEST_CUDA_LIBRARY=build/cuda/libpred_cuda.so $(BIN)/python -m pytest tests/test_cuda_library.py
 
-# Builds in place, for the GPUs that are there. CPU tensors of the tests go through the GPU: tests/conftest.py.
-test-cuda:
+# In place, for the GPUs that are there.
+cuda-build:
 	PRED_CUDA=1 PRED_REQUIRE_NATIVE=1 CUDAARCHS=native $(PYTHON) setup.py -q build_ext --inplace
+
+# CPU tensors of the tests go through the GPU: tests/conftest.py.
+test-cuda: cuda-build
 	PRED_REQUIRE_NATIVE=1 $(PYTHON) -m pytest -q tests/test_cuda.py
 	PRED_TEST_DEVICE=cuda PRED_REQUIRE_NATIVE=1 $(PYTHON) -m pytest -q $(CUDA_TESTS)
 	for tool in memcheck racecheck; do \
 		compute-sanitizer --tool $$tool --error-exitcode 1 --target-processes all \
 			$(PYTHON) -m pytest -q tests/test_cuda.py -k parity || exit 1; \
 	done
+
+# torch.compile takes part in the rendering step alone: compiling every phase of every op would take an hour.
+bench-cuda: cuda-build
+	$(PYTHON) -m benchmarks --device cuda --min-time 3 --ops rendering_step --out $(BENCH_OUT)-step.json
+	$(PYTHON) -m benchmarks --device cuda --quick --contenders ours,eager,peers --out $(BENCH_OUT)-ops.json
 
 # From another folder, since python -m puts the working one, with its pred/, first on the path.
 fuzz: sanitized

@@ -7,6 +7,7 @@ Each phase states the least traffic it could have: every input read once and eve
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,13 +16,12 @@ import torch
 from torch import Tensor
 
 from benchmarks import cases, models, ops_boxes, ops_field, ops_points, ops_rays, ops_sampling, ops_sparse
-from benchmarks.case import SECOND_ALONE, Case, Phase, Variant
+from benchmarks.case import BACKWARD, FORWARD, SECOND_ALONE, Case, Phase, Variant
 from benchmarks.cases import Sizes
-from benchmarks.measure import Run, time_interleaved
+from benchmarks.measure import CPU, Run, missing_kernel, time_interleaved
 from benchmarks.memory import added_peak_bytes
 from benchmarks.phases import prepare, prepare_compiled
-from benchmarks.report import NOT_INSTALLED, Row
-from pred._native import native_status
+from benchmarks.report import NOT_INSTALLED, Row, Target
 
 FAMILIES = {
     "sampling": ops_sampling.CASES,
@@ -35,12 +35,24 @@ FAMILIES = {
 CASES = {op: make for family in FAMILIES.values() for op, make in family.items()}
 
 
-def make_cases(op: str, sizes: Sizes) -> list[Case]:
-    """The cases of an op; targets belong to the real sizes."""
-    found = CASES[op](sizes)
-    if sizes == cases.REAL:
-        return found
-    return [replace(case, phases=tuple(replace(phase, targets=()) for phase in case.phases)) for case in found]
+BOUND_BY_MEMORY = ("sample_bev", "sample_volume", "composite_rays", "composite_alpha")
+"""Ops that should come near the copy bandwidth of a GPU."""
+
+
+def make_cases(op: str, sizes: Sizes, device: torch.device = CPU) -> list[Case]:
+    """The cases of an op on a device; targets belong to the real sizes on the CPU, those of the paper on a GPU."""
+    return [
+        replace(case, phases=tuple(replace(phase, targets=targets(op, phase, sizes, device)) for phase in case.phases))
+        for case in (case.to(device) for case in CASES[op](sizes))
+    ]
+
+
+def targets(op: str, phase: Phase, sizes: Sizes, device: torch.device) -> tuple[Target, ...]:
+    """What a phase should reach with these sizes on a device."""
+    if device.type == "cpu":
+        return phase.targets if sizes == cases.REAL else ()
+    near_copy = sizes == cases.PAPER and op in BOUND_BY_MEMORY and phase.name in (FORWARD, BACKWARD)
+    return (Target("copy bandwidth", 0.7),) if near_copy else ()
 
 
 def expected_results(case: Case, phase: Phase) -> list[Tensor]:
@@ -68,10 +80,10 @@ def run_phase(
     """
     rows, runs = check_phase(case, phase, expected, threads, kinds, on_step)
     on_step(f"{case.name}, {phase.name}, {threads} threads: timing")
-    for name, timing in time_interleaved(runs, threads, min_time_s, rounds).items():
+    for name, timing in time_interleaved(runs, threads, min_time_s, rounds, case.device).items():
         rows[name].timing = timing
     for name, run in runs.items():
-        peaks = [added_peak_bytes(run.ready()) for _ in range(2)]
+        peaks = [added_peak_bytes(run.ready(), case.device) for _ in range(2)]
         rows[name].peak_memory_bytes = min((peak for peak in peaks if peak is not None), default=None)
     return list(rows.values())
 
@@ -120,13 +132,16 @@ def check_phase(
             flop_dtype=phase.flop_dtype,
             targets=phase.targets,
         )
-        if kind == "ours" and case.needs_kernel and (reason := missing_kernel(case.op)):
+        if kind == "ours" and case.needs_kernel and (reason := missing_kernel(case.op, case.device)):
             row.status = f"missing: {reason}"
             continue
         try:
             variant = make_variant()
         except ImportError:
             row.status = NOT_INSTALLED
+            continue
+        except NotImplementedError as error:
+            row.status = f"refused: {first_line(error)}"
             continue
         try:
             run = (prepare_compiled if kind == "compiled" else prepare)(case, phase, variant)
@@ -159,7 +174,7 @@ def _contenders(case: Case, phase: Phase, kinds: Sequence[str]) -> list[tuple[st
     if "compiled" in kinds and phase.name != SECOND_ALONE:
         found += [("compiled", f"compiled {name}", known(case.eager[name])) for name in case.compiled]
     if "peers" in kinds:
-        found += [("peer", name, make_variant) for name, make_variant in case.peers.items()]
+        found += [("peer", name, functools.partial(make, case.device)) for name, make in case.peers.items()]
     return found
 
 
@@ -181,14 +196,6 @@ def _compare(actual: list[Tensor], expected: list[Tensor], case: Case) -> tuple[
         if missed > case.outliers:
             wrong = wrong or f"result {number} differs by {float(difference.max()):.2g}"
     return worst, wrong
-
-
-def missing_kernel(op: str) -> str | None:
-    """Why an op has no compiled kernel; None where it has one."""
-    reason: str | None = native_status()["reason"]
-    if reason is None and not hasattr(torch.ops.pred, op):
-        return f"the compiled library has no {op}"
-    return reason
 
 
 def first_line(error: Exception) -> str:

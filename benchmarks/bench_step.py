@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rendering step: from a BEV map to the gradients of the loss, without the encoder.
 
-Per step: 512 depth rays (with the Eikonal term) and 512 semantic rays, each with a coarse pass, resampling to 96 + 128
-samples, decoding, compositing and losses; then the backward pass to the map and to every parameter. Contenders:
+Per step: depth rays (with the Eikonal term) and as many semantic rays (512 each at real sizes, 3072 at the paper's),
+each with a coarse pass, resampling to 96 + 128 samples, decoding, compositing and losses; then the backward pass to the
+map and to every parameter. Where the memory of a GPU does not hold the plain contenders' step, all take a quarter of
+the rays less, again and again until it does; the name of the case tells. Contenders:
 
 ``ours``       `pred.models` on the compiled kernels; also with the decoder's ``recompute`` and ``bf16``
 ``reference``  the same model on the PyTorch references of `pred.ops`
 ``eager``      plain PyTorch as one would write it first: `F.grid_sample`, and the SDF's gradient by
-               `autograd.grad(create_graph=True)`
+               `autograd.grad(create_graph=True)`; beside ours in bfloat16 also in `torch.autocast`
 ``compiled``   `torch.compile` of ``reference``, forward and backward pass in one graph
 
 Useful arithmetic, in multiply-adds (P encoding width, h hidden, L Linear layers, C map channels, K classes): the
@@ -37,9 +39,9 @@ from torch import Tensor
 
 from benchmarks import cases
 from benchmarks.allocator import current_allocator, enter_allocator
-from benchmarks.bench_ops import first_line, missing_kernel
+from benchmarks.bench_ops import first_line
 from benchmarks.cases import SIZES, Sizes
-from benchmarks.measure import time_interleaved
+from benchmarks.measure import CPU, missing_kernel, time_interleaved
 from benchmarks.memory import added_peak_bytes
 from benchmarks.phases import compiled
 from benchmarks.report import Row, Target
@@ -70,10 +72,10 @@ class PlainField(FieldDecoder):
     ) -> DecodedField:
         """As `FieldDecoder.decode`, from the map."""
         points_m = points_m.detach().requires_grad_(with_gradient)
-        low, high = torch.tensor(self.point_range).view(2, 3)
+        low, high = points_m.new_tensor(self.point_range).view(2, 3)
         position = (points_m - (low + high) / 2) / ((high - low) / 2)
         features = F.grid_sample(projected, position[:, None, :, :2], align_corners=False)[:, :, 0].transpose(1, 2)
-        octaves = 2.0 ** torch.arange(self.config.frequencies)
+        octaves = 2.0 ** torch.arange(self.config.frequencies, device=points_m.device)
         angles = (position[..., None, :] * octaves[:, None]).flatten(-2)
         activation = torch.cat([features, position, angles.sin(), angles.cos()], dim=-1)
         *hidden_layers, output_layer = self.layers
@@ -81,7 +83,8 @@ class PlainField(FieldDecoder):
         for layer in hidden_layers:
             activation = F.softplus(layer(activation), self.config.softplus_beta)
         rows = slice(None) if semantics else slice(1)
-        output = F.linear(activation, output_layer.weight[rows], output_layer.bias[rows])
+        with torch.autocast(points_m.device.type, enabled=False):  # distances are kept in float32
+            output = F.linear(activation.float(), output_layer.weight[rows], output_layer.bias[rows])
         sdf = output[..., 0] * self.config.sdf_scale_m
         gradient = None
         if with_gradient:
@@ -93,33 +96,37 @@ class Rays:
     """Rays from one origin to measured points."""
 
     def __init__(self, points_m: Tensor, origin_m: tuple[float, float, float], seed: int) -> None:
-        offset = points_m - torch.tensor(origin_m)
+        origin = points_m.new_tensor(origin_m)
+        offset = points_m - origin
         self.depth_m = offset.norm(dim=-1)[None]  # [1, R]
         self.directions = offset[None] / self.depth_m[..., None]  # [1, R, 3]
-        self.origins = torch.tensor(origin_m).expand_as(self.directions)
+        self.origins = origin.expand_as(self.directions)
         self.valid = torch.ones_like(self.depth_m, dtype=torch.bool)
-        self.jitter = torch.rand(self.depth_m.shape, generator=torch.Generator().manual_seed(seed))
+        jitter = torch.rand(self.depth_m.shape, generator=torch.Generator().manual_seed(seed))
+        self.jitter = jitter.to(points_m.device)
 
 
 class Step:
     """One rendering step: map, rays, and the models."""
 
-    def __init__(self, sizes: Sizes, field_type: type[FieldDecoder], **options: Any) -> None:
+    def __init__(
+        self, sizes: Sizes, field_type: type[FieldDecoder], device: torch.device = CPU, **options: Any
+    ) -> None:
         torch.manual_seed(0)
         config = FieldConfig(hidden=sizes.step_hidden, num_classes=sizes.classes, **options)
-        self.field = field_type(sizes.bev_channels, config, cases.POINT_RANGE_M)
+        self.field = field_type(sizes.bev_channels, config, cases.POINT_RANGE_M).to(device)
         self.renderer = Renderer(
             RendererConfig(coarse_samples=sizes.coarse_samples, fine_samples=sizes.fine_samples), cases.POINT_RANGE_M
         )
-        self.sharpness = Sharpness(self.renderer.config.initial_inv_s)
-        self.bev = cases.bev_map(sizes.bev_channels, sizes.bev_cells).requires_grad_()
+        self.sharpness = Sharpness(self.renderer.config.initial_inv_s).to(device)
+        self.bev = cases.bev_map(sizes.bev_channels, sizes.bev_cells).to(device).requires_grad_()
         count = sizes.step_rays
         points = cases.lidar_points(max(2 * count, sizes.points // 10))[:, :3]
-        points = points[torch.randperm(len(points))[: 2 * count]]
+        points = points[torch.randperm(len(points))[: 2 * count]].to(device)
         self.depth = Rays(points[:count], (0.0, 0.0, 0.0), seed=1)
         self.semantic = Rays(points[count:], (0.0, 1.5, -0.3), seed=2)
-        self.target = F.one_hot(torch.randint(sizes.classes, (1, count)), sizes.classes).float()
-        self.confidence = torch.ones(1, count)
+        self.target = F.one_hot(torch.randint(sizes.classes, (1, count)), sizes.classes).float().to(device)
+        self.confidence = torch.ones(1, count, device=device)
         self.leaves = [self.bev, *self.field.parameters(), *self.sharpness.parameters()]
 
     def loss(self) -> Tensor:
@@ -154,13 +161,15 @@ VARIANTS: dict[str, dict[str, Any]] = {
 """Options of the decoder. Each variant is a case of its own, with the same other contenders."""
 
 
-def contender(name: str, sizes: Sizes) -> Run:
+def contender(name: str, sizes: Sizes, device: torch.device = CPU) -> Run:
     """One step of a contender; it returns the loss, then the gradients of the map and of every parameter."""
-    step = Step(sizes, PlainField if name == "eager" else FieldDecoder, **VARIANTS.get(name, {}))
+    kind, _, options = name.partition(", ")
+    step = Step(sizes, PlainField if kind == "eager" else FieldDecoder, device, **VARIANTS.get(name, {}))
     backend = "native" if name in VARIANTS else "reference"
 
     def loss_and_gradients() -> list[Tensor]:
-        loss = step.loss()
+        with torch.autocast(device.type, torch.bfloat16, enabled=kind == "eager" and options == "bf16"):
+            loss = step.loss()
         return [loss.detach(), *torch.autograd.grad(loss, step.leaves)]
 
     call: Run = compiled(loss_and_gradients) if name == "compiled" else loss_and_gradients
@@ -187,7 +196,12 @@ def useful_flop(sizes: Sizes) -> int:
 
 
 def run_step(
-    sizes_name: str, threads: int, kinds: Sequence[str], min_time_s: float, on_step: Callable[[str], None]
+    sizes_name: str,
+    threads: int,
+    kinds: Sequence[str],
+    min_time_s: float,
+    on_step: Callable[[str], None],
+    device: torch.device = CPU,
 ) -> list[Row]:
     """Checks the contenders against ``reference``, times them, and measures the memory that each adds.
 
@@ -197,8 +211,29 @@ def run_step(
         kinds: which of `CONTENDERS` take part; ``reference`` always does.
         min_time_s: see `time_interleaved`; a step of real size takes one call per round.
         on_step: told what happens next.
+        device: where the step runs.
     """
     sizes = SIZES[sizes_name]
+    while True:
+        try:
+            return _run_step(sizes_name, sizes, threads, kinds, min_time_s, on_step, device)
+        except torch.OutOfMemoryError:
+            if sizes.step_rays < 64:
+                raise
+            sizes = replace(sizes, step_rays=sizes.step_rays * 3 // 4)
+            on_step(f"step: out of the GPU's memory, now with {sizes.step_rays} + {sizes.step_rays} rays")
+        torch.cuda.empty_cache()
+
+
+def _run_step(
+    sizes_name: str,
+    sizes: Sizes,
+    threads: int,
+    kinds: Sequence[str],
+    min_time_s: float,
+    on_step: Callable[[str], None],
+    device: torch.device,
+) -> list[Row]:
     torch.set_num_threads(threads)
     if "compiled" in kinds:
         torch._dynamo.reset()
@@ -206,15 +241,19 @@ def run_step(
     runs: dict[str, Run] = {}
     expected: list[Tensor] = []
     names = ["reference", *(VARIANTS if "ours" in kinds else ()), *(kind for kind in CONTENDERS[1:] if kind in kinds)]
+    if {"ours", "eager"} <= set(kinds):
+        names.append("eager, bf16")
     for name in names:
         on_step(f"step, {threads} threads: {name}")
-        row = rows[name] = _row(name, sizes, threads)
-        if name in VARIANTS and (reason := missing_kernel("composite_rays")):
+        row = rows[name] = _row(name, sizes, threads, device)
+        if name in VARIANTS and (reason := missing_kernel("composite_rays", device)):
             row.status = f"missing: {reason}"
             continue
         try:
-            run = contender(name, sizes)
+            run = contender(name, sizes, device)
             result = run()
+        except torch.OutOfMemoryError:
+            raise
         except Exception as error:  # a compiler may refuse in any way; the run goes on
             row.status = f"refused: {first_line(error)}"
             continue
@@ -226,20 +265,28 @@ def run_step(
         else:
             runs[name] = run
     on_step(f"step, {threads} threads: timing")
-    for name, timing in time_interleaved(runs, threads, min_time_s, ROUNDS).items():
+    for name, timing in time_interleaved(runs, threads, min_time_s, ROUNDS, device).items():
         rows[name].timing = timing
-    for name in runs:
-        if name != "compiled":  # its compiler's memory would count
+    for name, run in runs.items():
+        if device.type == "cuda":
+            rows[name].peak_memory_bytes = added_peak_bytes(run, device)
+        elif name != "compiled":  # its compiler's memory would count
             on_step(f"step, {threads} threads: memory of {name}")
             _add_memory(rows[name], sizes_name)
-    found = list(rows.values())
+    found = [row for name, row in rows.items() if name in VARIANTS or row.flop_dtype == "float32"]
     for name in VARIANTS:
         if name != "ours" and name in rows:
-            found += [replace(row, case=rows[name].case) for other, row in rows.items() if other not in VARIANTS]
+            others = (row for other, row in rows.items() if other not in VARIANTS)
+            half = rows[name].flop_dtype == "bfloat16"
+            found += [
+                replace(row, case=rows[name].case, targets=rows[name].targets)
+                for row in others
+                if row.flop_dtype == "float32" or half
+            ]
     return found
 
 
-def _row(name: str, sizes: Sizes, threads: int) -> Row:
+def _row(name: str, sizes: Sizes, threads: int, device: torch.device) -> Row:
     rays, samples = sizes.step_rays, (sizes.coarse_samples, sizes.fine_samples)
     kind, _, variant = name.partition(", ")
     return Row(
@@ -255,8 +302,17 @@ def _row(name: str, sizes: Sizes, threads: int) -> Row:
         work="useful FLOP of the matrix products, see benchmarks/bench_step.py",
         flop=useful_flop(sizes),
         flop_dtype="bfloat16" if "bf16" in name else "float32",
-        targets=(Target("eager", 4), Target("eager's memory", 4)) if sizes == cases.REAL and not variant else (),
+        targets=targets(sizes, variant, device),
     )
+
+
+def targets(sizes: Sizes, variant: str, device: torch.device) -> tuple[Target, ...]:
+    """What the step should reach; of `variant`, see `VARIANTS`, the name without "ours"."""
+    if device.type == "cuda" and replace(sizes, step_rays=cases.PAPER.step_rays) == cases.PAPER:
+        return Target("eager", 5), Target("compiled", 2), Target("eager's memory", 4)
+    if device.type == "cpu" and sizes == cases.REAL and not variant:
+        return Target("eager", 4), Target("eager's memory", 4)
+    return ()
 
 
 def _compare(actual: list[Tensor], expected: list[Tensor], tolerances: tuple[float, float]) -> tuple[float, str]:

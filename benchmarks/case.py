@@ -5,10 +5,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from benchmarks.report import Target
 
@@ -75,8 +76,31 @@ class Case:
     """Share of elements that may miss the tolerance, with the reason beside it."""
     needs_kernel: bool = True
     """Ours is a kernel of the op's name; without it there is nothing to time."""
-    peers: Mapping[str, Callable[[], Variant]] = field(default_factory=dict)
-    """Other libraries, by name. The call imports the library, so that a missing one is an ImportError of its own."""
+    peers: Mapping[str, Callable[[torch.device], Variant]] = field(default_factory=dict)
+    """Other libraries, by name. The call imports the library, so that a missing one is an ImportError of its own; it
+    raises NotImplementedError where the library cannot work on the device of the inputs."""
+    modules: tuple[nn.Module, ...] = ()
+    """What the functions hold beside their inputs."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the inputs are."""
+        return self.inputs[0].device
+
+    def to(self, device: torch.device) -> Case:
+        """The case on a device: its inputs, those of its variants, and (in place) its modules."""
+        for module in self.modules:
+            module.to(device)
+
+        def moved(variant: Variant) -> Variant:
+            return variant if variant.inputs is None else replace(variant, inputs=_on(device, variant.inputs))
+
+        eager = {name: moved(variant) for name, variant in self.eager.items()}
+        return replace(self, inputs=_on(device, self.inputs), eager=eager)
+
+
+def _on(device: torch.device, tensors: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    return tuple(tensor.to(device) for tensor in tensors)
 
 
 def spread(arguments: Mapping[str, Any]) -> dict[str, Any]:

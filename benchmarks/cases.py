@@ -9,7 +9,7 @@ order, BEV samples along rays, signed distances that cross one surface per ray.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -125,7 +125,9 @@ TINY = Sizes(
     dsvt_cells=36,
     dsvt_m=3.0,
 )
-SIZES = {"tiny": TINY, "real": REAL}
+PAPER = replace(REAL, bev_rays=3072, bev_samples_per_ray=224, rays=6144, step_rays=3072, search_points=131_072)
+"""As many rays as a training step of the paper has; for GPUs."""
+SIZES = {"tiny": TINY, "real": REAL, "paper": PAPER}
 
 
 class RaySamples(NamedTuple):

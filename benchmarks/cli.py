@@ -21,7 +21,7 @@ from benchmarks.capture import CaptureError, capture_steps, captured_cases
 from benchmarks.case import Case
 from benchmarks.cases import SIZES
 from benchmarks.compare import relative
-from benchmarks.measure import COPY_BYTES, measure_ceilings
+from benchmarks.measure import measure_ceilings
 from benchmarks.options import parse
 from benchmarks.phases import phases_of
 from benchmarks.picture import PictureError, draw
@@ -40,7 +40,8 @@ def main() -> None:
     try:
         if options.trace:
             step = SIZES[options.sizes] if STEP in options.ops and not options.replay else None
-            write_trace(options.trace, chosen_cases(options), step, max(options.threads), chosen_kinds(options))
+            kinds, threads = chosen_kinds(options), max(options.threads)
+            write_trace(options.trace, chosen_cases(options), step, threads, kinds, options.device)
             print(f"written: {options.trace}; open it in chrome://tracing or ui.perfetto.dev")
         elif options.capture:
             print(capture_steps(options.capture, options.capture_from, SIZES[options.sizes]))
@@ -57,7 +58,8 @@ def run(options: argparse.Namespace) -> Report:
     kinds = chosen_kinds(options)
     with_step = STEP in options.ops and not options.replay
     plain_kinds = [kind for kind in options.contenders if kind in ("ours", "eager")]
-    with_default = bool(cases and plain_kinds) and not (options.default_allocator or options.quick or options.replay)
+    with_default = bool(cases and plain_kinds) and options.device.type == "cpu"
+    with_default = with_default and not (options.default_allocator or options.quick or options.replay)
     phases = sum(len(phases_of(case)) for case in cases) * len(options.threads)
     progress = Progress(2 * len(options.threads) + phases + STEP_UNITS * with_step + phases // 2 * with_default)
 
@@ -77,9 +79,11 @@ def run(options: argparse.Namespace) -> Report:
 
         def on_step(what: str) -> None:
             progress.show(what)
-            progress.advance(STEP_UNITS // 14)  # seven contenders, their timing, memory of six
+            progress.advance(STEP_UNITS // 16)  # eight contenders, their timing, memory of seven
 
-        report.rows += run_step(options.sizes, max(options.threads), options.contenders, options.min_time, on_step)
+        report.rows += run_step(
+            options.sizes, max(options.threads), options.contenders, options.min_time, on_step, options.device
+        )
         progress.done = done + STEP_UNITS
         report.write()
     if with_default:
@@ -94,8 +98,8 @@ def chosen_cases(options: argparse.Namespace) -> list[Case]:
     """Of the ops asked for; those of a capture where there is one."""
     ops = [op for op in options.ops if op != STEP]
     if options.replay:
-        return captured_cases(options.replay, ops)
-    return [case for op in ops for case in make_cases(op, SIZES[options.sizes])]
+        return [case.to(options.device) for case in captured_cases(options.replay, ops)]
+    return [case for op in ops for case in make_cases(op, SIZES[options.sizes], options.device)]
 
 
 def chosen_kinds(options: argparse.Namespace) -> list[str]:
@@ -126,10 +130,9 @@ def finish(report: Report, options: argparse.Namespace) -> int | str:
 
 def _add_ceilings(report: Report, options: argparse.Namespace, progress: Progress) -> None:
     """Measured before and after all else; the better counts."""
-    copy_bytes = COPY_BYTES if options.sizes == "real" else 1 << 20
     for threads in options.threads:
         progress.show(f"ceilings with {threads} threads")
-        found = measure_ceilings(threads, options.min_time, copy_bytes)
+        found = measure_ceilings(threads, options.min_time, options.device, options.sizes == "tiny")
         report.ceilings[threads] = found.better(report.ceilings.get(threads, found))
         progress.advance()
 

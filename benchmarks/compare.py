@@ -18,6 +18,7 @@ Record = Mapping[str, Any]
 _CIRCUMSTANCES = {
     "processor": ("machine", "cpu"),
     "cores": ("machine", "cores"),
+    "GPU": ("machine", "gpu", "name"),
     "torch": ("versions", "torch"),
     "instruction set": ("native", "cpu_capability"),
     "sizes": ("sizes",),

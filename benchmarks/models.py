@@ -35,7 +35,7 @@ def _dsvt_cases(sizes: Sizes) -> list[Case]:
     for pillars in sizes.dsvt_pillars:
         coords = cases.lidar_pillars(pillars, sizes.dsvt_cells, sizes.dsvt_m)
         features = torch.randn(len(coords), config.d_model, generator=torch.Generator().manual_seed(1))
-        reference = _call(plain, names, coords)
+        reference = _call(plain, names)
         forward = 2 * useful_multiply_adds(config, coords, grid)
         work = "2 (2 blocks) M (4 C^2 + 2 C F + 2 l C)"
         found.append(
@@ -44,12 +44,13 @@ def _dsvt_cases(sizes: Sizes) -> list[Case]:
                 name=f"DSVT-P, nuScenes, {len(coords)} pillars",
                 unit="pillars",
                 items=len(coords),
-                inputs=(features, *parameters.values()),
-                ours=_call(ours, names, coords),
+                inputs=(features, coords, *parameters.values()),
+                modules=(ours, plain),
+                ours=_call(ours, names),
                 reference=reference,
                 eager={"nn.MultiheadAttention": Variant(reference)},
                 compiled=(),  # the number of sets depends on the coordinates
-                derivative_in=(0, *(1 + i for i, name in enumerate(names) if not name.endswith(UNUSED_BIAS))),
+                derivative_in=(0, *(2 + i for i, name in enumerate(names) if not name.endswith(UNUSED_BIAS))),
                 # Two orders of summation in float32, through eight layers and batch normalisation
                 tolerance=1e-3,
                 needs_kernel=False,
@@ -73,8 +74,8 @@ def useful_multiply_adds(config: DSVTConfig, coords: Tensor, grid: tuple[int, in
     return found
 
 
-def _call(model: nn.Module, names: list[str], coords: Tensor) -> Function:
-    def call(features: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
+def _call(model: nn.Module, names: list[str]) -> Function:
+    def call(features: Tensor, coords: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
         values = dict(zip(names, parameters, strict=True))
         return (torch.func.functional_call(model, values, (features, coords, 1)),)
 

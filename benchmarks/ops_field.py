@@ -107,10 +107,11 @@ def _call(function: Callable[..., DecodedField], with_gradient: bool, options: d
 
 def _network(bev: Tensor, points: Tensor, layers: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """As one would write it: gather, concatenate, MLP."""
-    low, high = torch.tensor(POINT_RANGE_M).view(2, 3)
+    low, high = points.new_tensor(POINT_RANGE_M).view(2, 3)
     position = (points - (low + high) / 2) / ((high - low) / 2)
     features = F.grid_sample(bev, position[:, None, :, :2], align_corners=False)[:, :, 0].transpose(1, 2)
-    angles = (position[..., None, :] * 2.0 ** torch.arange(FREQUENCIES)[:, None]).flatten(-2)
+    octaves = 2.0 ** torch.arange(FREQUENCIES, device=points.device)
+    angles = (position[..., None, :] * octaves[:, None]).flatten(-2)
     values = torch.cat([features, position, angles.sin(), angles.cos()], dim=-1)
     for weight, bias in zip(layers[:-2:2], layers[1:-2:2], strict=True):
         values = F.softplus(F.linear(values, weight, bias), BETA)

@@ -59,7 +59,8 @@ def _eager_voxelize(
     )
     xyz = points[:, :3]
     x, y, z = ((xyz - low) / points.new_tensor(size)).long().unbind(dim=1)
-    frame = torch.repeat_interleave(torch.arange(len(offsets) - 1), offsets.diff(), output_size=len(points))
+    frames = torch.arange(len(offsets) - 1, device=points.device)
+    frame = torch.repeat_interleave(frames, offsets.diff(), output_size=len(points))
     key = ((frame * nz + z) * ny + y) * nx + x
     inside = ((xyz >= low) & (xyz < high)).all(dim=1)
     keys, voxel, counts = unique(key[inside])
@@ -124,10 +125,10 @@ def _eager_voxelize_hard(
     voxel, order = point_to_voxel[rows].sort(stable=True)
     rows = rows[order]
     starts = counts.cumsum(0) - counts
-    place = torch.arange(len(rows)) - starts[voxel]
+    place = torch.arange(len(rows), device=rows.device) - starts[voxel]
     kept = rows[starts].argsort()[:max_voxels]  # the inputs are one frame
     number = torch.full_like(counts, -1)
-    number[kept] = torch.arange(len(kept))
+    number[kept] = torch.arange(len(kept), device=kept.device)
     fits = (number[voxel] >= 0) & (place < max_points)
     slot = number[voxel[fits]] * max_points + place[fits]
     flat = points.new_zeros(len(kept) * max_points, points.shape[1]).index_copy(0, slot, points[rows[fits]])
@@ -157,7 +158,7 @@ def _farthest_point_sample_cases(sizes: Sizes) -> list[Case]:
 def _eager_farthest(points: Tensor, count: int) -> Tensor:  # [1, count]
     x, y, z = points.t().contiguous()
     distance = torch.full_like(x, torch.inf)
-    chosen = torch.zeros(count, dtype=torch.int64)
+    chosen = torch.zeros(count, dtype=torch.int64, device=points.device)
     for i in range(1, count):
         last = chosen[i - 1]
         dx, dy, dz = x - x[last], y - y[last], z - z[last]
@@ -255,7 +256,7 @@ def _ball_query_cases(sizes: Sizes) -> list[Case]:
 
 def _eager_ball(points: Tensor, queries: Tensor, radius_m: float, count: int) -> tuple[Tensor, Tensor]:
     none = len(points)
-    row = torch.arange(none)
+    row = torch.arange(none, device=points.device)
     lists = []
     for chunk in queries.split(_CHUNK):
         inside = torch.cdist(chunk, points, compute_mode="donot_use_mm_for_euclid_dist") < radius_m

@@ -270,7 +270,7 @@ def _eager_composite_padded(
 ) -> tuple[Tensor, ...]:
     """Rows as long as the longest ray; the padding's distance lets everything pass."""
     counts = ray_offsets.diff()
-    valid = torch.arange(int(counts.max())) < counts[:, None]
+    valid = torch.arange(int(counts.max()), device=sdf.device) < counts[:, None]
 
     def pad(samples: Tensor, fill: float) -> Tensor:
         return samples.new_full((*valid.shape, *samples.shape[1:]), fill).masked_scatter_(
@@ -289,7 +289,7 @@ def _eager_composite_log_space(
     rays' sums would cost the last ones their digits."""
     counts = ray_offsets.diff()
     rays = counts.shape[0]
-    ray = torch.repeat_interleave(torch.arange(rays), counts)
+    ray = torch.repeat_interleave(torch.arange(rays, device=sdf.device), counts)
     inside = F.pad((ray[1:] == ray[:-1]).to(sdf.dtype), (0, 1))
     alpha = F.pad(_eager_alpha(sdf[None], inv_s)[0], (0, 1)) * inside
     passed = F.pad(torch.cumsum(torch.log1p(-alpha).double(), dim=0), (1, 0))
@@ -339,12 +339,18 @@ def _eager_samples(t: Tensor, weights: Tensor, added: int) -> Tensor:
     mass = torch.where(total > 0, mass, t[:, 1:] - t[:, :-1])
     cdf = F.pad(mass.cumsum(dim=1), (1, 0))
     cdf = cdf / cdf[:, -1:]
-    u = ((torch.arange(added, dtype=t.dtype) + 0.5) / added).expand(t.shape[0], -1).contiguous()
+    u = _middles(t, added)
     after = torch.searchsorted(cdf, u, right=True).clamp_max(t.shape[1] - 1)
     before = after - 1
     low, high = cdf.gather(1, before), cdf.gather(1, after)
     start, end = t.gather(1, before), t.gather(1, after)
     return torch.lerp(start, end, (u - low) / (high - low))
+
+
+def _middles(t: Tensor, added: int) -> Tensor:  # [R, added]
+    """Of so many equal parts of [0, 1], for each ray."""
+    middle = (torch.arange(added, dtype=t.dtype, device=t.device) + 0.5) / added
+    return middle.expand(t.shape[0], -1).contiguous()
 
 
 def _section_cases(sizes: Sizes) -> list[Case]:
@@ -418,7 +424,7 @@ def _sample_pdf_cases(sizes: Sizes) -> list[Case]:
 def _eager_samples_neus(t: Tensor, weights: Tensor, added: int) -> Tensor:
     mass = weights[:, :-1] + 1e-5
     cdf = F.pad((mass / mass.sum(dim=1, keepdim=True)).cumsum(dim=1), (1, 0))
-    u = ((torch.arange(added, dtype=t.dtype) + 0.5) / added).expand(t.shape[0], -1).contiguous()
+    u = _middles(t, added)
     index = torch.searchsorted(cdf, u, right=True)
     before, after = (index - 1).clamp_min(0), index.clamp_max(t.shape[1] - 1)
     low = cdf.gather(1, before)

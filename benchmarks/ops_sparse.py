@@ -98,10 +98,10 @@ def _layer(kind: str, rulebook: Rulebook, channels: int, outputs: int, dtype: to
         name=f"sparse_conv {sites} sites, {channels} to {outputs}, 3x3x3 {kind}",
         unit="sites",
         items=sites,
-        inputs=(features, weight),
-        ours=lambda features, weight: (ops.sparse_conv(features, weight, out_to_in, in_to_out),),
-        reference=lambda features, weight: (reference.sparse_conv(features, weight, out_to_in, in_to_out),),
-        eager={"index_add": Variant(_per_tap(out_to_in))},
+        inputs=(features, weight, out_to_in, in_to_out),
+        ours=lambda *inputs: (ops.sparse_conv(*inputs),),
+        reference=lambda *inputs: (reference.sparse_conv(*inputs),),
+        eager={"index_add": Variant(_per_tap, (features, weight, out_to_in, *_pairs(out_to_in)))},
         compiled=(),
         derivative_in=(0, 1),
         tolerance=5e-2 if half else 1e-4,  # eager adds up in bfloat16
@@ -112,17 +112,18 @@ def _layer(kind: str, rulebook: Rulebook, channels: int, outputs: int, dtype: to
     )
 
 
-def _per_tap(out_to_in: Tensor) -> Callable[[Tensor, Tensor], tuple[Tensor, ...]]:
-    """Each tap's pairs are listed outside the time, as frameworks keep them."""
-    pairs = [(rows := (column >= 0).nonzero()[:, 0], column[rows].long()) for column in out_to_in.unbind(1)]
+def _pairs(out_to_in: Tensor) -> list[Tensor]:
+    """Each tap's outputs, then each tap's inputs, listed outside the time, as frameworks keep them."""
+    rows = [(column >= 0).nonzero()[:, 0] for column in out_to_in.unbind(1)]
+    return rows + [out_to_in[row, tap].long() for tap, row in enumerate(rows)]
 
-    def run(features: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
-        out = features.new_zeros(len(out_to_in), len(weight))
-        for tap, (rows, sources) in enumerate(pairs):
-            out = out.index_add(0, rows, features[sources] @ weight[:, tap].T)
-        return (out,)
 
-    return run
+def _per_tap(features: Tensor, weight: Tensor, out_to_in: Tensor, *pairs: Tensor) -> tuple[Tensor, ...]:
+    taps = len(pairs) // 2
+    out = features.new_zeros(len(out_to_in), len(weight))
+    for tap, (rows, sources) in enumerate(zip(pairs[:taps], pairs[taps:], strict=True)):
+        out = out.index_add(0, rows, features[sources] @ weight[:, tap].T)
+    return (out,)
 
 
 class _ResidualBlock(nn.Module):
@@ -210,32 +211,33 @@ def _backbone(sites: Tensor, width: int) -> Case:
     features = torch.randn(len(sites), channels, generator=torch.Generator().manual_seed(2))
     flop = _useful_flop(net, SparseTensor(features, sites, SHAPE, 1))
 
-    def ours(features: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
+    def ours(features: Tensor, sites: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
         x = SparseTensor(features, sites, SHAPE, 1)
         out = torch.func.functional_call(net, dict(zip(names, parameters, strict=True)), (x,))
         return (out.features,)
 
-    def plain(features: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
+    def plain(*inputs: Tensor) -> tuple[Tensor, ...]:
         with unittest.mock.patch.dict(os.environ, PRED_BACKEND="reference"):
-            return ours(features, *parameters)
+            return ours(*inputs)
 
     return Case(
         op="sparse_conv",
         name=f"VoxelResBackBone8x {len(sites)} sites, rulebooks included",
         unit="sites",
         items=len(sites),
-        inputs=(features, *(parameter.detach() for parameter in net.parameters())),
+        inputs=(features, sites, *(parameter.detach() for parameter in net.parameters())),
+        modules=(net,),
         ours=ours,
         reference=plain,
         eager={"product per tap": Variant(plain)},
         compiled=(),
-        derivative_in=tuple(range(1 + len(names))),
+        derivative_in=(0, *range(2, 2 + len(names))),
         tolerance=1e-3,  # of 21 layers
         phases=(
             Phase(FORWARD, "", 0, work="2 P C O of all layers", flop=flop),
             Phase(BACKWARD, "", 0, (Target("peer", 4),), work="6 P C O of all layers", flop=3 * flop),
         ),
-        peers=peers.sparse_backbone(lambda sparse: _Backbone(sparse, channels, width), names, sites, SHAPE),
+        peers=peers.sparse_backbone(lambda sparse: _Backbone(sparse, channels, width), names, SHAPE),
     )
 
 
@@ -243,41 +245,37 @@ def _sparse_max_pool_cases(sizes: Sizes) -> list[Case]:
     sites = _sites(sizes)
     _, out_to_in, in_to_out = ops.build_rulebook(sites, 1, SHAPE, **STRIDED)
     features = torch.randn(len(sites), sizes.sparse_channels, generator=torch.Generator().manual_seed(1))
-    rows, out = features.nbytes, 4 * len(out_to_in) * sizes.sparse_channels
+    rows, taps = (out_to_in >= 0).nonzero().unbind(1)
+    sources = out_to_in[rows, taps].long()
+    read, out = features.nbytes, 4 * len(out_to_in) * sizes.sparse_channels
     return [
         Case(
             op="sparse_max_pool",
             name=f"sparse_max_pool {len(sites)} to {len(out_to_in)} sites, {sizes.sparse_channels}, 3x3x3 stride 2",
             unit="sites",
             items=len(sites),
-            inputs=(features,),
-            ours=lambda features: (ops.sparse_max_pool(features, out_to_in, in_to_out),),
-            reference=lambda features: (reference.sparse_max_pool(features, out_to_in, in_to_out),),
-            eager={"scatter_reduce": Variant(_pool_by_scatter(out_to_in))},
+            inputs=(features, out_to_in, in_to_out),
+            ours=lambda *inputs: (ops.sparse_max_pool(*inputs),),
+            reference=lambda *inputs: (reference.sparse_max_pool(*inputs),),
+            eager={"scatter_reduce": Variant(_pool_by_scatter, (features, out_to_in, rows, sources))},
             compiled=(),
             derivative_in=(0,),
             phases=(
-                Phase(FORWARD, "4 M C + 4 K M' + 4 M' C", rows + out_to_in.nbytes + out),
+                Phase(FORWARD, "4 M C + 4 K M' + 4 M' C", read + out_to_in.nbytes + out),
                 Phase(
                     BACKWARD,
                     "8 M C + 8 K M' + 4 K M + 8 M' C",
-                    2 * (rows + out_to_in.nbytes + out) + in_to_out.nbytes,
+                    2 * (read + out_to_in.nbytes + out) + in_to_out.nbytes,
                 ),
             ),
         )
     ]
 
 
-def _pool_by_scatter(out_to_in: Tensor) -> Callable[[Tensor], tuple[Tensor, ...]]:
-    rows, taps = (out_to_in >= 0).nonzero().unbind(1)
-    sources = out_to_in[rows, taps].long()
-
-    def run(features: Tensor) -> tuple[Tensor, ...]:
-        empty = features.new_zeros(len(out_to_in), features.shape[1])
-        index = rows[:, None].expand(-1, features.shape[1])
-        return (empty.scatter_reduce(0, index, features[sources], "amax", include_self=False),)
-
-    return run
+def _pool_by_scatter(features: Tensor, out_to_in: Tensor, rows: Tensor, sources: Tensor) -> tuple[Tensor, ...]:
+    empty = features.new_zeros(len(out_to_in), features.shape[1])
+    index = rows[:, None].expand(-1, features.shape[1])
+    return (empty.scatter_reduce(0, index, features[sources], "amax", include_self=False),)
 
 
 CASES: dict[str, Callable[[Sizes], list[Case]]] = {

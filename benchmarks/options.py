@@ -17,7 +17,7 @@ from benchmarks.bench_step import STEP
 from benchmarks.case import KINDS
 from benchmarks.cases import SIZES
 from benchmarks.compare import RecordError, load_record
-from benchmarks.measure import ROUNDS
+from benchmarks.measure import CPU, ROUNDS
 
 OPS = (*CASES, STEP)
 QUICK = 5
@@ -35,8 +35,9 @@ phases
   grid with create_graph, backward through both), and second backward (the last part of it alone)
 
 ms is the median of all calls, IQR the distance of the quartiles; contenders take turns, and "rounds" is the range of
-the ratio over the turns. GB/s counts the least traffic an op could have (formula in the JSON), "of ceiling" its share
-of the copy bandwidth measured in the same run with as many threads. Inputs that fit into the last-level cache can pass
+the ratio over the turns. On a GPU a call lies between two events of its stream, and a cache's worth of memory is
+written before each. GB/s counts the least traffic an op could have (formula in the JSON), "of ceiling" its share of the
+copy bandwidth measured in the same run with as many threads. Inputs that fit into the last-level cache can pass
 100 %. "peak MB" is what one call adds to the process's memory at most, scratch included. Everything runs with malloc's
 thresholds raised (the program restarts itself with MALLOC_MMAP_THRESHOLD_ and MALLOC_TRIM_THRESHOLD_ set), so that page
 faults of large fresh outputs do not count; the ratio with the default allocator, measured in a shorter run, stands
@@ -45,6 +46,7 @@ beside.
 examples
   python -m benchmarks --ops sample_bev --threads 1,2 --compare benchmarks/results/epyc-2core.json
   python -m benchmarks --ops sample_bev --sizes tiny --contenders ours --trace trace.json
+  python -m benchmarks --device cuda --ops rendering_step --min-time 2
   python -m benchmarks --capture ops.pt --capture-from nuscenes_tiny.yaml
   python -m benchmarks --replay ops.pt
 """
@@ -63,12 +65,19 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     what.add_argument(
         "--ops", type=_list_of(OPS), nargs="+", default=[list(OPS)], help=f"some of {', '.join(OPS)}; or with commas"
     )
-    what.add_argument("--sizes", choices=tuple(SIZES), default="real", help="real LiDAR sizes, or tiny ones")
+    what.add_argument("--device", type=_device, default=CPU, help="cpu (the default) or cuda, the current GPU")
+    what.add_argument(
+        "--sizes",
+        choices=tuple(SIZES),
+        default=None,
+        help="real LiDAR sizes (the default on the CPU), with the rays of a paper's training step (the default on a "
+        "GPU), or tiny ones",
+    )
     what.add_argument(
         "--threads",
         type=_thread_counts,
         default=None,
-        help="such as 1,2; default: 1 and all cores; the rendering step is run with the most only",
+        help="such as 1,2; default: 1 and all cores, on a GPU all; the rendering step is run with the most only",
     )
     what.add_argument("--contenders", type=_list_of(KINDS), default=list(KINDS), help=f"some of {','.join(KINDS)}")
     what.add_argument(
@@ -139,7 +148,11 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         parser.error(f"--compare {error}")
     options.ops = [op for names in options.ops for op in names]
     options.out = options.out or Path(time.strftime("benchmarks/results/%Y%m%dT%H%M%SZ.json", time.gmtime()))
-    options.threads = options.threads or sorted({1, torch.get_num_threads()})
+    on_gpu = options.device.type == "cuda"
+    options.sizes = options.sizes or ("paper" if on_gpu else "real")
+    options.threads = options.threads or sorted({torch.get_num_threads(), *(() if on_gpu else (1,))})
+    if on_gpu and len(options.threads) > 1:
+        parser.error(f"--threads must be one number with --device cuda, got {options.threads}")
     options.rounds = 3 if options.quick else ROUNDS
     if options.quick:
         options.min_time /= QUICK
@@ -155,6 +168,14 @@ def _list_of(choices: Sequence[str]) -> Any:
         return names
 
     return parse
+
+
+def _device(text: str) -> torch.device:
+    if text not in ("cpu", "cuda"):
+        raise argparse.ArgumentTypeError(f"must be cpu or cuda, got {text!r}")
+    if text == "cuda" and not torch.cuda.is_available():
+        raise argparse.ArgumentTypeError("must be cpu, as torch sees no GPU, got 'cuda'")
+    return torch.device(text)
 
 
 def _thread_counts(text: str) -> list[int]:

@@ -1,6 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""Other libraries that do an op's work on the CPU, for `Case.peers`.
+"""Other libraries that do an op's work, for `Case.peers`.
 
 Each function gives name -> factory; the factory imports its library, so that a missing one only leaves a row out. Peers
 use the threads they use: "cores busy" in the tables shows how many (spconv's and mmcv's voxels: one).
@@ -27,13 +27,13 @@ from torch import Tensor, nn
 from benchmarks.case import Function, Variant
 from pred.data.boxes import corners_bev
 
-Peers = Mapping[str, Callable[[], Variant]]
+Peers = Mapping[str, Callable[[torch.device], Variant]]
 
 
 def segment_reduce(num_segments: int, reduce: str) -> Peers:
     """For inputs ``(features, index)`` in which no index is -1."""
 
-    def torch_scatter() -> Variant:
+    def torch_scatter(device: torch.device) -> Variant:
         from torch_scatter import scatter
 
         return Variant(lambda features, index: (scatter(features, index, 0, None, num_segments, reduce),))
@@ -49,7 +49,7 @@ def composite(alpha: Callable[[Tensor, Tensor], Tensor] | None = None) -> Peers:
             the inputs hold them.
     """
 
-    def nerfacc() -> Variant:
+    def nerfacc(device: torch.device) -> Variant:
         from nerfacc import accumulate_along_rays, render_weight_from_alpha
 
         def render(*inputs: Tensor) -> tuple[Tensor, ...]:
@@ -70,13 +70,13 @@ def voxelize_hard(
     """For inputs ``(points, batch_offsets)`` of one frame, and the results voxels, coords and counts."""
     size, bounds = list(voxel_size), list(point_range)
 
-    def spconv() -> Variant:
+    def spconv(device: torch.device) -> Variant:
         from spconv.pytorch.utils import PointToVoxel
 
-        make_voxels = PointToVoxel(size, bounds, channels, max_voxels, max_points)
+        make_voxels = PointToVoxel(size, bounds, channels, max_voxels, max_points, device)
         return Variant(_of_one_frame(make_voxels), as_ours=_with_frame)
 
-    def mmcv() -> Variant:
+    def mmcv(device: torch.device) -> Variant:
         from mmcv.ops import Voxelization
 
         make_voxels = Voxelization(size, bounds, max_points, max_voxels)
@@ -100,27 +100,27 @@ def _with_frame(results: list[Tensor]) -> list[Tensor]:
     return [voxels, torch.nn.functional.pad(coords.long(), (1, 0)), counts.long()]
 
 
-def sparse_backbone(
-    make: Callable[[Any], nn.Module], names: Sequence[str], sites: Tensor, shape: Sequence[int]
-) -> Peers:
-    """For inputs ``(features, *parameters)`` of one frame; the result is the output sites' features, ascending.
+def sparse_backbone(make: Callable[[Any], nn.Module], names: Sequence[str], shape: Sequence[int]) -> Peers:
+    """For inputs ``(features, sites, *parameters)`` of one frame; the result is the output sites' features, ascending.
 
     Args:
         make: the network, from a module that holds the layers.
         names: of its parameters.
-        sites, shape: (b, z, y, x) of the features, and cells (z, y, x).
+        shape: cells (z, y, x).
     """
 
-    def spconv() -> Variant:
+    def spconv(device: torch.device) -> Variant:
         import spconv.pytorch as library
 
-        library.ops.get_current_stream = lambda: 0  # its backward pass asks for CUDA's and does not use it
-        net, indices = make(library), sites.int()
+        on_cpu = device.type == "cpu"
+        if on_cpu:
+            library.ops.get_current_stream = lambda: 0  # its backward pass asks for CUDA's and does not use it
+        net = make(library).to(device)
 
-        def run(features: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
-            if torch.get_num_threads() != 1:
+        def run(features: Tensor, sites: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
+            if on_cpu and torch.get_num_threads() != 1:
                 raise RuntimeError("spconv's CPU build is right with one thread only")
-            x = library.SparseConvTensor(features, indices, list(shape), 1)
+            x = library.SparseConvTensor(features, sites.int(), list(shape), 1)
             out = torch.func.functional_call(net, dict(zip(names, parameters, strict=True)), (x,))
             z, y, x = out.indices[:, 1:].long().unbind(1)
             order = ((z * out.spatial_shape[1] + y) * out.spatial_shape[2] + x).argsort()
@@ -142,8 +142,8 @@ def box_iou(boxes_a: Tensor, boxes_b: Tensor, with_height: bool) -> Peers:
             shared = shared * (top - bottom).clamp_min(0)
         return shared / (sizes_a[:, None] + sizes_b - shared)
 
-    def spconv() -> Variant:
-        wrap, box_ops = _spconv_boxes()
+    def spconv(device: torch.device) -> Variant:
+        wrap, box_ops = _spconv_boxes(device)
         # Its tensors do not keep the arrays' memory.
         corners_a, corners_b = _clockwise(boxes_a), _clockwise(boxes_b)
 
@@ -156,7 +156,8 @@ def box_iou(boxes_a: Tensor, boxes_b: Tensor, with_height: bool) -> Peers:
 
         return Variant(run)
 
-    def shapely() -> Variant:
+    def shapely(device: torch.device) -> Variant:
+        _cpu_only(device)
         import shapely as library
 
         polygons_a, polygons_b = (library.polygons(corners_bev(boxes.double().numpy())) for boxes in (boxes_a, boxes_b))
@@ -176,8 +177,8 @@ def box_iou(boxes_a: Tensor, boxes_b: Tensor, with_height: bool) -> Peers:
 def nms_bev(boxes: Tensor, scores: Tensor, iou_threshold: float) -> Peers:
     """For inputs ``(boxes, scores)``."""
 
-    def spconv() -> Variant:
-        wrap, box_ops = _spconv_boxes()
+    def spconv(device: torch.device) -> Variant:
+        wrap, box_ops = _spconv_boxes(device)
         corners = _clockwise(boxes)
 
         def run(boxes: Tensor, scores: Tensor) -> tuple[Tensor, ...]:
@@ -194,7 +195,8 @@ def nms_bev(boxes: Tensor, scores: Tensor, iou_threshold: float) -> Peers:
 def points_in_boxes(boxes: Tensor, first: bool) -> Peers:
     """For inputs ``(points, boxes)``; the first box of each point, or the mask as uint8."""
 
-    def shapely() -> Variant:
+    def shapely(device: torch.device) -> Variant:
+        _cpu_only(device)
         import shapely as library
 
         polygons = library.polygons(corners_bev(boxes.double().numpy()))
@@ -218,12 +220,18 @@ def points_in_boxes(boxes: Tensor, first: bool) -> Peers:
     return {"shapely": shapely}
 
 
-def _spconv_boxes() -> tuple[Callable[[NDArray[np.generic]], Any], Any]:
+def _spconv_boxes(device: torch.device) -> tuple[Callable[[NDArray[np.generic]], Any], Any]:
     """What makes its tensors, and its operations on boxes."""
+    _cpu_only(device)
     from cumm import tensorview
     from spconv.core_cc.csrc.utils.boxops import BoxOps
 
     return tensorview.from_numpy, BoxOps
+
+
+def _cpu_only(device: torch.device) -> None:
+    if device.type != "cpu":
+        raise NotImplementedError("works on the CPU only")
 
 
 def _clockwise(boxes: Tensor) -> NDArray[np.float32]:  # [N, 4, 2]

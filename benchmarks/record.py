@@ -35,11 +35,12 @@ class Report:
             "command": shlex.join(["python", "-m", "benchmarks", *sys.argv[1:]]),
             "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
             "allocator": current_allocator(),
+            "device": options.device.type,
             "sizes": "captured" if options.replay else options.sizes,
             "threads": options.threads,
             "min_time_s": options.min_time,
             "rounds": options.rounds,
-            **machine_record(),
+            **machine_record(options.device),
         }
 
     def content(self, complete: bool) -> dict[str, Any]:
@@ -89,6 +90,12 @@ class Report:
 
     def _summary(self) -> str:
         machine, versions, native = (self._head[name] for name in ("machine", "versions", "native"))
+        gpu = machine["gpu"]
+        if gpu is not None:
+            return (
+                f"{gpu['name']}, CUDA {gpu['cuda']}, driver {gpu['driver']}, torch {versions['torch']}; "
+                f"{machine['cpu']}, {machine['cores']} cores"
+            )
         return (
             f"{machine['cpu']}, {machine['cores']} cores, torch {versions['torch']}, "
             f"kernels {native['cpu_capability'] or 'missing'}, malloc thresholds {self._head['allocator']}, "

@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from benchmarks import memory, peers
-from benchmarks.bench_ops import expected_results, make_cases, run_phase
+from benchmarks.bench_ops import CASES, expected_results, make_cases, run_phase
 from benchmarks.case import BACKWARD, BACKWARD_ALONE, FORWARD, SECOND, SECOND_ALONE, Case, Variant
 from benchmarks.cases import TINY
 from benchmarks.compare import RecordError, against_earlier, changes, earlier_text, load_record
-from benchmarks.measure import Run, time_interleaved
+from benchmarks.measure import CPU, Run, time_interleaved
 from benchmarks.phases import phases_of, prepare
 from benchmarks.picture import PictureError, draw
 from benchmarks.report import NOT_INSTALLED, Row, Table, missing_peers
@@ -68,6 +68,78 @@ def test_what_runs_before_a_call_is_not_timed() -> None:
     timing = time_interleaved({"a": Run(call, before)}, 1, min_time_s=1e-6, rounds=3)["a"]
     assert order == ["before", "call 7"] * 3 and timing.samples == 3
     assert timing.median_s < 0.01
+
+
+def test_time_on_a_gpu_is_that_between_two_events(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a stand-in for the GPU whose clock only calls move: 2 ms each, after 50 ms that do not count."""
+    clock_ms, order = 0.0, []
+
+    class Event:
+        def __init__(self, enable_timing: bool) -> None:
+            assert enable_timing
+
+        def record(self) -> None:
+            order.append("event")
+            self.at_ms = clock_ms
+
+        def elapsed_time(self, end: Event) -> float:
+            assert order[-1] == "synchronize"
+            return end.at_ms - self.at_ms
+
+    def before() -> int:
+        nonlocal clock_ms
+        clock_ms += 50
+        order.append("before")
+        return 7
+
+    def call(prepared: int) -> list[Tensor]:
+        nonlocal clock_ms
+        clock_ms += 2
+        order.append(f"call {prepared}")
+        return []
+
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: order.append("synchronize"))
+    timing = time_interleaved({"a": Run(call, before)}, 1, 0.06, rounds=3, device=torch.device("meta"))["a"]
+    one = ["before", "event", "call 7", "event"]
+    assert order == (one + ["synchronize"] + 10 * one + ["synchronize"]) * 3  # one to see how many fit into 20 ms
+    assert timing.median_s == pytest.approx(2e-3) and timing.samples == 30
+    assert timing.page_faults_per_call is None and timing.busy_cores is None
+
+
+def held(function: Any) -> list[Tensor]:
+    """Tensors that a function has beside its arguments."""
+    found: list[Tensor] = []
+    for cell in getattr(function, "__closure__", None) or ():
+        value = cell.cell_contents
+        found += [value] if isinstance(value, Tensor) else held(value) if callable(value) else []
+    return found
+
+
+@pytest.mark.parametrize("op", CASES)
+def test_cases_can_be_moved(op: str) -> None:
+    """All that a case works on goes to the device with it, and its functions make their own tensors there."""
+    found = make_cases(op, TINY)
+    for case in found:
+        functions = [case.ours, case.reference, *(variant.function for variant in case.eager.values())]
+        assert not any(held(function) for function in functions), case.name
+        for name, variant in {"reference": Variant(case.reference), **case.eager}.items():
+            inputs = case.inputs if variant.inputs is None else variant.inputs
+            with torch.device("meta"):  # what is made without a word about the device lands here, and does not fit
+                results = variant.function(*inputs)
+            assert all(result.device == CPU for result in results), f"{case.name}, {name}"
+    for case in found:
+        moved = case.to(torch.device("meta"))
+        tensors = [*moved.inputs, *(tensor for variant in moved.eager.values() for tensor in variant.inputs or ())]
+        tensors += [tensor for module in moved.modules for tensor in (*module.parameters(), *module.buffers())]
+        assert moved.device.type == "meta" and all(tensor.is_meta for tensor in tensors), case.name
+
+
+def test_a_peer_of_the_cpu_refuses_a_gpu() -> None:
+    pytest.importorskip("shapely")
+    (case,) = make_cases("points_in_boxes", TINY)
+    with pytest.raises(NotImplementedError, match="works on the CPU only"):
+        case.peers["shapely"](torch.device("cuda"))
 
 
 def test_memory_is_the_peak_of_one_call() -> None:
@@ -125,7 +197,7 @@ def test_a_missing_peer_is_only_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_results_of_a_peer_are_brought_into_our_form() -> None:
     (case,) = make_cases("resample_rays", TINY)
     doubled = Variant(lambda t, weights: (2 * case.reference(t, weights)[0],), as_ours=lambda results: [results[0] / 2])
-    (row,) = rows_of(replace(case, peers={"doubled": lambda: doubled}), ["peers"])
+    (row,) = rows_of(replace(case, peers={"doubled": lambda device: doubled}), ["peers"])
     assert row.status == "ok"
 
 
@@ -154,8 +226,9 @@ def test_peers_of_voxelize_hard(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against a stand-in with spconv's signatures."""
 
     class PointToVoxel:
-        def __init__(self, size: list[float], bounds: list[float], channels: int, voxels: int, points: int) -> None:
+        def __init__(self, size: Any, bounds: Any, channels: int, voxels: int, points: int, device: Any) -> None:
             assert (size, bounds, channels, voxels, points) == ([1.0] * 3, [0.0] * 3 + [2.0] * 3, 4, 7, 5)
+            assert device == CPU
 
         def __call__(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             return points[None], torch.tensor([[3, 2, 1]], dtype=torch.int32), torch.tensor([2], dtype=torch.int32)
@@ -166,7 +239,7 @@ def test_peers_of_voxelize_hard(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
     monkeypatch.setitem(sys.modules, "spconv.pytorch.utils", module)
     make = peers.voxelize_hard(4, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 2.0, 2.0, 2.0), max_points=5, max_voxels=7)
-    variant = make["spconv"]()
+    variant = make["spconv"](CPU)
     points = torch.rand(2, 4)
     assert variant.as_ours is not None
     voxels, coords, counts = variant.as_ours(list(variant.function(points, torch.tensor([0, 2]))))

@@ -19,9 +19,9 @@ from PIL import Image
 
 from benchmarks import bench_ops, bench_step, cases, models
 from benchmarks.bench_ops import expected_results, make_cases, run_phase
-from benchmarks.case import BACKWARD, BACKWARD_ALONE, FORWARD, SECOND, SECOND_ALONE, Variant
-from benchmarks.cases import REAL, TINY
-from benchmarks.measure import Ceilings, Timing, time_interleaved
+from benchmarks.case import BACKWARD, BACKWARD_ALONE, FORWARD, SECOND, SECOND_ALONE, Phase, Variant
+from benchmarks.cases import PAPER, REAL, TINY, Sizes
+from benchmarks.measure import CPU, Ceilings, Timing, time_interleaved
 from benchmarks.options import parse
 from benchmarks.report import Row, Table, Target, compare, comparison_table, row_table
 from pred import _native
@@ -159,6 +159,7 @@ def test_compiled_runs_or_says_why_not() -> None:
         (["--threads", "two"], "must be positive numbers"),
         (["--min-time", "0"], "must be above 0, got 0.0"),
         (["--sizes", "huge"], "invalid choice: 'huge'"),
+        (["--device", "tpu"], "must be cpu or cuda, got 'tpu'"),
         (["--fail-below", "0.9"], "--fail-below needs --compare"),
         (["--compare", "none.json"], "none.json: must be a record of python -m benchmarks, got no such file"),
         (["--out", "result.png"], "--out must name the JSON record, got result.png"),
@@ -169,6 +170,57 @@ def test_wrong_arguments(arguments: list[str], message: str, capsys: pytest.Capt
     with pytest.raises(SystemExit, match="2"):
         parse(arguments)
     assert message in capsys.readouterr().err
+
+
+def test_a_gpu_needs_a_gpu(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SystemExit, match="2"):
+        parse(["--device", "cuda"])
+    assert "must be cpu, as torch sees no GPU, got 'cuda'" in capsys.readouterr().err
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    options = parse(["--device", "cuda"])
+    assert options.sizes == "paper" and options.threads == [torch.get_num_threads()]
+    with pytest.raises(SystemExit, match="2"):
+        parse(["--device", "cuda", "--threads", "1,2"])
+    assert "--threads must be one number with --device cuda, got [1, 2]" in capsys.readouterr().err
+
+
+def test_targets_of_a_gpu() -> None:
+    """On the CPU they belong to the real sizes, on a GPU to those of the paper."""
+    gpu = torch.device("cuda")
+    (phase,) = make_cases("resample_rays", TINY)[0].phases
+    forward, backward = (Phase(name, "", 1, (Target("eager", 3),)) for name in (FORWARD, BACKWARD))
+    assert phase.targets == () and bench_ops.targets("sample_bev", forward, REAL, CPU) == forward.targets
+    for moving in (forward, backward):
+        assert bench_ops.targets("sample_bev", moving, PAPER, gpu) == (Target("copy bandwidth", 0.7),)
+    assert bench_ops.targets("knn", forward, PAPER, gpu) == bench_ops.targets("sample_bev", forward, REAL, gpu) == ()
+    step = bench_step.targets(replace(PAPER, step_rays=2304), "bf16", gpu)
+    assert [(target.against, target.at_least) for target in step] == [
+        ("eager", 5),
+        ("compiled", 2),
+        ("eager's memory", 4),
+    ]
+    assert bench_step.targets(REAL, "bf16", CPU) == bench_step.targets(PAPER, "", CPU) == ()
+
+
+def test_a_step_that_does_not_fit_is_made_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[int] = []
+
+    def contender(name: str, sizes: Sizes, device: torch.device) -> bench_step.Run:
+        tried.append(sizes.step_rays)
+        if sizes.step_rays > 1800 and name == "eager":
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return lambda: [torch.ones(()), torch.ones(3)]
+
+    monkeypatch.setattr(bench_step, "contender", contender)
+    steps: list[str] = []
+    gpu = torch.device("meta")
+    monkeypatch.setattr(bench_step, "time_interleaved", lambda runs, *rest: dict.fromkeys(runs, timing(1.0)))
+    monkeypatch.setattr(bench_step, "_add_memory", lambda row, sizes_name: None)
+    rows = bench_step.run_step("paper", 1, ["eager"], 0.1, steps.append, gpu)
+    assert tried == [3072, 3072, 2304, 2304, 1728, 1728]
+    assert [(row.contender, row.items) for row in rows] == [("reference", 3456), ("eager", 3456)]
+    assert "step: out of the GPU's memory, now with 2304 + 2304 rays" in steps
 
 
 def test_a_wrong_result_gets_no_time() -> None:

@@ -149,7 +149,7 @@ def check_sites(op: str, sites: Tensor, batch_size: int, shape: Triple) -> None:
     """``sites [M, 4]`` int64 must lie inside the grid and be distinct; looked at in eager CPU calls."""
     if torch.compiler.is_compiling() or sites.device.type != "cpu":
         return
-    extent = torch.tensor([batch_size, *shape])
+    extent = sites.new_tensor([batch_size, *shape])
     outside = ((sites < 0) | (sites >= extent)).any(dim=1).nonzero()
     if outside.numel():
         row = int(outside[0, 0])

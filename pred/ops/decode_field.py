@@ -57,7 +57,7 @@ class _Settings(NamedTuple):
 
     def box(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """Centre and half extent of the range box, metres."""
-        low, high = torch.tensor(self.point_range, dtype=torch.float64).view(2, 3)
+        low, high = like.new_tensor(self.point_range, dtype=torch.float64).view(2, 3)
         return ((low + high) / 2).to(like), ((high - low) / 2).to(like)
 
 
