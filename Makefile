@@ -94,8 +94,8 @@ emulate: $(VENV)/dev.stamp
 	rm -rf $(EMULATED)
 	PRED_CUDA=emulate PRED_SANITIZE=address,undefined PRED_REQUIRE_NATIVE=1 \
 		$(PIP) install --no-deps --no-build-isolation --target $(EMULATED) .
-	PYTHONPATH=$(EMULATED) PRED_EMULATION_ORDER=$(ORDER) $(SANITIZED) $(BIN)/python -m pytest -p no:cacheprovider \
-		-o pythonpath="$(EMULATED) ." $(CUDA_TESTS) $(SLOW_TO_EMULATE:%=--deselect=tests/ops/%)
+	PYTHONPATH=$(EMULATED) PRED_EMULATION_ORDER=$(ORDER) OMP_NUM_THREADS=1 $(SANITIZED) $(BIN)/python -m pytest -n auto \
+		-p no:cacheprovider -o pythonpath="$(EMULATED) ." $(CUDA_TESTS) $(SLOW_TO_EMULATE:%=--deselect=tests/ops/%)
 
 cuda-compile: $(VENV)/dev.stamp
 	$(BIN)/cmake -G Ninja -S . -B build/cuda -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN))/ninja -DPRED_CUDA=ON -DPRED_HOST=OFF \

@@ -17,32 +17,33 @@ STABLE_TORCH_LIBRARY(pred, m) {
   // Test hook of common/parallel.h: throws in a worker when fail_at >= 0.
   m.def("parallel_probe(Tensor out, int grain, int fail_at) -> ()");
 
+  // deterministic: see SampleGridKernels; on the CPU the gradient of a map always has the same bits.
   // The second output of *_with_grad is the derivative in the grid, [B, N, 2 or 3, C].
   m.def("sample_bev(Tensor bev, Tensor grid, bool border, bool align_corners) -> Tensor");
   m.def(
       "sample_bev_backward(Tensor grad, Tensor bev, Tensor grid, bool border, bool align_corners, "
-      "bool need_bev, bool need_grid) -> (Tensor, Tensor)");
+      "bool need_bev, bool need_grid, bool deterministic) -> (Tensor, Tensor)");
   m.def(
       "sample_bev_double_backward(Tensor? grad_grad_bev, Tensor? grad_grad_grid, Tensor grad, Tensor bev, "
-      "Tensor grid, bool border, bool align_corners, bool need_grad, bool need_bev, bool need_grid) -> "
-      "(Tensor, Tensor, Tensor)");
+      "Tensor grid, bool border, bool align_corners, bool need_grad, bool need_bev, bool need_grid, "
+      "bool deterministic) -> (Tensor, Tensor, Tensor)");
   m.def("sample_bev_with_grad(Tensor bev, Tensor grid, bool border, bool align_corners) -> (Tensor, Tensor)");
   m.def(
       "sample_bev_with_grad_backward(Tensor? grad_values, Tensor? grad_grads, Tensor bev, Tensor grid, bool border, "
-      "bool align_corners, bool need_bev, bool need_grid) -> (Tensor, Tensor)");
+      "bool align_corners, bool need_bev, bool need_grid, bool deterministic) -> (Tensor, Tensor)");
 
   m.def("sample_volume(Tensor volume, Tensor grid, bool border, bool align_corners) -> Tensor");
   m.def(
       "sample_volume_backward(Tensor grad, Tensor volume, Tensor grid, bool border, bool align_corners, "
-      "bool need_volume, bool need_grid) -> (Tensor, Tensor)");
+      "bool need_volume, bool need_grid, bool deterministic) -> (Tensor, Tensor)");
   m.def(
       "sample_volume_double_backward(Tensor? grad_grad_volume, Tensor? grad_grad_grid, Tensor grad, Tensor volume, "
-      "Tensor grid, bool border, bool align_corners, bool need_grad, bool need_volume, bool need_grid) -> "
-      "(Tensor, Tensor, Tensor)");
+      "Tensor grid, bool border, bool align_corners, bool need_grad, bool need_volume, bool need_grid, "
+      "bool deterministic) -> (Tensor, Tensor, Tensor)");
   m.def("sample_volume_with_grad(Tensor volume, Tensor grid, bool border, bool align_corners) -> (Tensor, Tensor)");
   m.def(
       "sample_volume_with_grad_backward(Tensor? grad_values, Tensor? grad_grads, Tensor volume, Tensor grid, "
-      "bool border, bool align_corners, bool need_volume, bool need_grid) -> (Tensor, Tensor)");
+      "bool border, bool align_corners, bool need_volume, bool need_grid, bool deterministic) -> (Tensor, Tensor)");
 
   m.def("project_bev(Tensor bev, Tensor weight) -> Tensor");
   m.def(
@@ -56,7 +57,7 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "decode_field_backward(Tensor? grad_sdf, Tensor? grad_semantics, Tensor? grad_gradient, Tensor projected, "
       "Tensor points, Tensor parameters, Tensor activation, Tensor chain, SymInt[] widths, "
       "float[] point_range, SymInt octaves, float beta, float sdf_scale, bool need_projected, bool need_points, "
-      "bool need_parameters) -> (Tensor, Tensor, Tensor)");
+      "bool need_parameters, bool deterministic) -> (Tensor, Tensor, Tensor)");
 
   m.def("segment_reduce(Tensor features, Tensor index, SymInt num_segments, str reduce) -> (Tensor, Tensor)");
   m.def("segment_reduce_backward(Tensor grad, Tensor index, Tensor saved, str reduce) -> Tensor");

@@ -164,6 +164,12 @@ def use_native(op: str, tensor: Tensor) -> bool:
     return _has_kernel(op, tensor.device.type, backend == "native")
 
 
+def deterministic() -> bool:
+    """Whether gradients of maps must have the same bits every time on CUDA too, where atomics are faster
+    (``torch.use_deterministic_algorithms``)."""
+    return torch.are_deterministic_algorithms_enabled()
+
+
 def checked(op: Callable[..., Any], *arguments: Any) -> Any:
     """Calls a compiled op that checks values. Its ValueError and MemoryError pass through torch 2.13 unchanged, and
     arrive from torch 2.15 as a RuntimeError of the same text."""

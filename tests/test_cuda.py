@@ -40,9 +40,16 @@ def run(example: Example, arguments: Arguments) -> dict[str, Tensor]:
     return evaluate(example.native, arguments, example.leaves(arguments), order_of(example))
 
 
+@pytest.fixture(params=["deterministic", "atomics"])
+def algorithms(request: pytest.FixtureRequest) -> None:
+    """Both kinds of sums."""
+    if request.param == "deterministic":
+        request.getfixturevalue("deterministic")
+
+
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("example", CUDA_EXAMPLES, ids=str)
-def test_parity_with_the_cpu(native: None, example: Example, dtype: torch.dtype) -> None:
+def test_parity_with_the_cpu(native: None, algorithms: None, example: Example, dtype: torch.dtype) -> None:
     for count in (1, 37, 260):
         arguments = example.example(count, dtype, seed=count)
         expected, actual = run(example, arguments), run(example, on_device(arguments))
@@ -57,14 +64,14 @@ def test_parity_with_the_cpu(native: None, example: Example, dtype: torch.dtype)
 
 
 @pytest.mark.parametrize("example", CUDA_EXAMPLES, ids=str)
-def test_the_same_bits_every_time(native: None, example: Example) -> None:
+def test_the_same_bits_every_time(native: None, deterministic: None, example: Example) -> None:
     arguments = on_device(example.example(example.many, torch.float32))
     first, second = run(example, arguments), run(example, arguments)
     assert all(torch.equal(second[name], value) for name, value in first.items())
 
 
 @pytest.mark.parametrize("example", CUDA_EXAMPLES, ids=str)
-def test_work_is_queued_on_the_current_stream(native: None, example: Example) -> None:
+def test_work_is_queued_on_the_current_stream(native: None, deterministic: None, example: Example) -> None:
     """Results are right where the stream has other work before it, and the host has not waited."""
     arguments = on_device(example.example(example.many, torch.float32))
     expected = run(example, arguments)
@@ -84,7 +91,7 @@ def test_work_is_queued_on_the_current_stream(native: None, example: Example) ->
     assert all(torch.equal(actual[name], value) for name, value in expected.items())
 
 
-def test_rendering_is_captured_in_a_graph(native: None) -> None:
+def test_rendering_is_captured_in_a_graph(native: None, deterministic: None) -> None:
     sdf = torch.randn(64, 40, device="cuda", requires_grad=True)
     t, values = torch.rand(64, 40, device="cuda").cumsum(1), torch.rand(64, 40, 5, device="cuda", requires_grad=True)
     bev = torch.randn(1, 16, 20, 20, device="cuda", requires_grad=True)
@@ -116,7 +123,7 @@ def test_rendering_is_captured_in_a_graph(native: None) -> None:
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_a_step_is_captured_in_a_graph(native: None, name: str) -> None:
+def test_a_step_is_captured_in_a_graph(native: None, deterministic: None, name: str) -> None:
     """The whole of it: coarse pass, resampling, decoding, compositing, losses and their gradients."""
     step = Step(TINY, FieldDecoder, torch.device("cuda"), **VARIANTS[name])
 
@@ -142,7 +149,7 @@ def test_a_step_is_captured_in_a_graph(native: None, name: str) -> None:
 
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="there is one CUDA device")
 @pytest.mark.parametrize("example", CUDA_EXAMPLES, ids=str)
-def test_the_tensors_device_counts(native: None, example: Example) -> None:
+def test_the_tensors_device_counts(native: None, deterministic: None, example: Example) -> None:
     arguments = example.example(example.many, torch.float32)
     first, second = run(example, on_device(arguments, "cuda:0")), run(example, on_device(arguments, "cuda:1"))
     assert all(second[name].device.index == 1 and torch.equal(second[name].cpu(), first[name].cpu()) for name in first)

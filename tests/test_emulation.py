@@ -10,6 +10,7 @@ import torch
 from pred import ops
 from tests.conftest import EMULATED, KERNEL_ERROR
 from tests.ops.examples import EXAMPLES, Example, evaluate, order_of
+from tests.tolerances import GRADIENT, assert_close
 
 pytestmark = pytest.mark.skipif(not EMULATED, reason="the CUDA kernels are not emulated here: make emulate")
 
@@ -18,7 +19,7 @@ ORDERS = ("forward", "backward", "shuffled")
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=str)
 def test_no_result_depends_on_the_order_of_threads(
-    native: None, example: Example, monkeypatch: pytest.MonkeyPatch
+    native: None, deterministic: None, example: Example, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where a barrier is missing, one of the orders reads what is not yet written."""
     for count in (3, 140):
@@ -29,6 +30,34 @@ def test_no_result_depends_on_the_order_of_threads(
             found.append(evaluate(example.native, arguments, example.leaves(arguments), min(order_of(example), 1)))
         for other in found[1:]:
             assert all(torch.equal(other[name], value) for name, value in found[0].items())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("op", ["sample_bev", "sample_volume"])
+def test_atomics_give_the_same_gradients(native: None, op: str, dtype: torch.dtype) -> None:
+    """Up to the order of sums: samples along rays, of which many in one cell, outside, NaN, and of several maps."""
+    axes, generator = (2 if op == "sample_bev" else 3), torch.Generator().manual_seed(0)
+    for channels, frames, samples in ((5, 2, 100), (8, 3, 37), (160, 1, 200)):
+        map_ = torch.randn(frames, channels, *(6, 7, 5)[:axes], generator=generator).to(dtype)
+        steps = torch.linspace(-1.3, 1.3, samples, dtype=torch.float64)[None, :, None] ** 3
+        grid = steps * torch.randn(frames, 1, axes, generator=generator)
+        grid[:, 10] = torch.nan
+        grid = grid.to(torch.float64 if dtype == torch.float64 else torch.float32)
+        grad = torch.randn(frames, samples, channels, generator=generator).to(dtype)
+        grads = torch.randn(frames, samples, axes, channels, generator=generator).to(dtype)
+        of_map, of_grid = torch.randn(map_.shape, generator=generator).to(dtype), torch.randn_like(grid)
+        for border in (False, True):
+            for name, arguments in {
+                "_backward": (grad, map_, grid, border, False, True, False),
+                "_with_grad_backward": (grad, grads, map_, grid, border, False, True, False),
+                "_double_backward": (of_map, of_grid, grad, map_, grid, border, False, False, True, False),
+            }.items():
+                backward = getattr(torch.ops.pred, op + name)
+                ordered, atomic = (backward(*arguments, deterministic) for deterministic in (True, False))
+                for here, there in zip(ordered, atomic, strict=True):
+                    assert here.shape == there.shape and torch.equal(here.isnan(), there.isnan()), name
+                    # Half precision has no atomics: the same bits
+                    assert_close(there.nan_to_num(), here.nan_to_num(), GRADIENT.get(dtype, 0.0), name)
 
 
 def test_unknown_order_is_refused(native: None, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -298,7 +298,7 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
     std::optional<Tensor> grad_sdf, std::optional<Tensor> grad_semantics, std::optional<Tensor> grad_gradient,
     const Tensor& projected, const Tensor& points, const Tensor& parameters, const Tensor& activation,
     const Tensor& chain, std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
-    double sdf_scale, bool need_projected, bool need_points, bool need_parameters) {
+    double sdf_scale, bool need_projected, bool need_points, bool need_parameters, bool deterministic) {
   const char* op = "decode_field_backward";
   return PRED_DISPATCH_FACTOR(op, projected.scalar_type(), [&] {
     Field<S> in(op, projected, points, parameters, widths, point_range, octaves, beta, sdf_scale);
@@ -341,7 +341,7 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
       in.args.map.grad = storage<S>(along.rows);
       in.args.map.grad_along = slopes ? storage<S>(along.slopes) : nullptr;
       in.args.map.grad_grad_grid = slopes ? storage<T>(along.directions) : nullptr;
-      out_map = SampleBev::scatter<S>(op, in.map, in.args.map, false, nullptr);
+      out_map = SampleBev::scatter<S>(op, in.map, in.args.map, false, deterministic, nullptr);
     }
     return std::make_tuple(out_map, out_points, out_parameters);
   });

@@ -93,6 +93,8 @@ struct SampleGridKernels {
   // Launched, in place of pack and scatter_band: writes all of grad_map. The workspace has so many bytes.
   int64_t (*scatter_bytes)(const Args&, int64_t batch);
   void (*scatter)(const Args&, int64_t batch, bool along_direction, S* grad_map, char* workspace);
+  // Launched: adds to grad_map without a workspace, in an order that is another every time. Null for half precision.
+  void (*scatter_atomically)(const Args&, int64_t batch, bool along_direction, S* grad_map);
 };
 
 template <typename S>

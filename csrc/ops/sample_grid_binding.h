@@ -143,24 +143,25 @@ struct SampleGrid {
   }
 
   static std::tuple<Tensor, Tensor> backward(const Tensor& grad, const Tensor& map, const Tensor& grid, bool border,
-                                             bool align_corners, bool need_map, bool need_grid) {
-    return first_order("_backward", grad, std::nullopt, map, grid, border, align_corners, need_map, need_grid);
+                                             bool align_corners, bool need_map, bool need_grid, bool deterministic) {
+    return first_order("_backward", grad, std::nullopt, map, grid, border, align_corners, need_map, need_grid,
+                       deterministic);
   }
 
   static std::tuple<Tensor, Tensor> with_grad_backward(std::optional<Tensor> grad_values,
                                                        std::optional<Tensor> grad_grads, const Tensor& map,
                                                        const Tensor& grid, bool border, bool align_corners,
-                                                       bool need_map, bool need_grid) {
+                                                       bool need_map, bool need_grid, bool deterministic) {
     PRED_CHECK(grad_values || grad_grads, Op::kName, "_with_grad_backward: one gradient must be given");
     return first_order("_with_grad_backward", grad_values, grad_grads, map, grid, border, align_corners, need_map,
-                       need_grid);
+                       need_grid, deterministic);
   }
 
   static std::tuple<Tensor, Tensor, Tensor> double_backward(std::optional<Tensor> grad_grad_map,
                                                             std::optional<Tensor> grad_grad_grid, const Tensor& grad,
                                                             const Tensor& map, const Tensor& grid, bool border,
                                                             bool align_corners, bool need_grad, bool need_map,
-                                                            bool need_grid) {
+                                                            bool need_grid, bool deterministic) {
     return PRED_DISPATCH_STORAGE(concat(Op::kName, "_double_backward"), map.scalar_type(), [&] {
       Inputs<S> in("_double_backward", map, grid, border, align_corners);
       in.set_grads(grad, std::nullopt);
@@ -177,7 +178,7 @@ struct SampleGrid {
                  [&](int64_t begin, int64_t end) { k.double_backward(a, grad_data, grid_data, begin, end); });
       }
       if (need_map && a.grad_grad_grid) {
-        out_map = scatter<S>(in.op.c_str(), in.map, in.args, true, nullptr);
+        out_map = scatter<S>(in.op.c_str(), in.map, in.args, true, deterministic, nullptr);
       } else if (need_map) {  // the map enters only through the grid's gradient
         out_map = new_channels_last(in.map);
         torch::stable::zero_(out_map);
@@ -190,11 +191,17 @@ struct SampleGrid {
   // not from kernels that are launched.
   template <typename S>
   static Tensor scatter(const char* op, const Tensor& map, const SampleGridArgs<S, kAxes>& a, bool along_direction,
-                        Compute<S>* grad_grid) {
+                        bool deterministic, Compute<S>* grad_grid) {
     constexpr int64_t kBandRows = 8;
     const int64_t batch = map.size(0), num_samples = batch * a.num_samples;
     const auto& k = Op::template table<S>();
     if (map.numel() == 0) return new_channels_last(map);  // whatever its other sizes are
+    if (kLaunch && !deterministic && k.scatter_atomically) {
+      Tensor grad_map = new_channels_last(map);
+      torch::stable::zero_(grad_map);
+      k.scatter_atomically(a, batch, along_direction, mutable_storage<S>(grad_map));
+      return grad_map;
+    }
     PRED_CHECK(num_samples < int64_t(1) << 31, op,
                ": samples must be fewer than 2^31 where the gradient of the map is wanted, got ", num_samples);
     SampleGridOrder order{nullptr, bits_for(num_samples), {}};
@@ -256,7 +263,7 @@ struct SampleGrid {
   static std::tuple<Tensor, Tensor> first_order(const char* suffix, const std::optional<Tensor>& grad,
                                                 const std::optional<Tensor>& grad_slopes, const Tensor& map,
                                                 const Tensor& grid, bool border, bool align_corners, bool need_map,
-                                                bool need_grid) {
+                                                bool need_grid, bool deterministic) {
     return PRED_DISPATCH_STORAGE(concat(Op::kName, suffix), map.scalar_type(), [&] {
       Inputs<S> in(suffix, map, grid, border, align_corners);
       in.set_grads(grad, grad_slopes);
@@ -268,7 +275,7 @@ struct SampleGrid {
       }
       if (need_map) {
         if (need_grid && !kLaunch) torch::stable::zero_(grad_grid);  // samples that touch nothing are not visited
-        grad_map = scatter<S>(in.op.c_str(), in.map, in.args, false, data);
+        grad_map = scatter<S>(in.op.c_str(), in.map, in.args, false, deterministic, data);
       }
       if (need_grid && (kLaunch || !need_map)) {
         const auto& k = Op::template table<S>();

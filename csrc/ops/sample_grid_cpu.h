@@ -419,8 +419,9 @@ void double_backward(const SampleGridArgs<S, Axes>& a, S* grad_out, Compute<S>* 
 
 template <typename S, int Axes>
 constexpr SampleGridKernels<S, Axes> sample_grid_kernels() {
-  return {forward<S, Axes>, pack<S, Axes>, scatter_band<S, Axes>, backward_grid<S, Axes>, double_backward<S, Axes>,
-          nullptr,          nullptr};
+  return {
+      forward<S, Axes>, pack<S, Axes>, scatter_band<S, Axes>, backward_grid<S, Axes>, double_backward<S, Axes>, nullptr,
+      nullptr,          nullptr};
 }
 
 #undef PRED_INLINE

@@ -9,6 +9,9 @@
 // one cell of the map and adds up what up to 4 (8) of these runs send to it, in their order: no two threads write one
 // address, and the sums have the same bits every time. Rays start in one place, so runs can be long there: pieces of
 // kPiece items, at multiples of it, that lie within one run are added up beforehand, each by a warp of its own.
+// Scatter with atomics, where the order of a sum may be another every time: a group takes kRun neighbouring samples and
+// adds them up in registers as long as they lie in one cell, as those along a ray do; then all of its lanes add to the
+// map.
 #pragma once
 
 #include "common/bits.h"
@@ -190,6 +193,17 @@ struct LowerCorners {
     key_bits = bits_for(count + 1);
   }
 
+  // That of the cell in which a sample of map number `map` lies; -1 where it touches no cell.
+  template <typename T>
+  __device__ int64_t key_of(int64_t map, const LinearStencil<T, Axes>& s) const {
+    int64_t low[Axes];
+    for (int axis = 0; axis < Axes; ++axis) {
+      if (!s.axis[axis].low_inside && !s.axis[axis].high_inside) return -1;
+      low[axis] = s.axis[axis].low;
+    }
+    return key(map, low);
+  }
+
   // Of the cell whose lower corner has coordinates `low`, from -1 on.
   __device__ int64_t key(int64_t map, const int64_t (&low)[Axes]) const {
     int64_t number = map;
@@ -224,15 +238,8 @@ template <typename S, int Axes>
 __global__ void pack_kernel(SampleGridArgs<S, Axes> a, LowerCorners<Axes> corners, int64_t num_samples,
                             uint64_t* items) {
   for (int64_t sample = first_thread(); sample < num_samples; sample += thread_stride()) {
-    const auto s = stencil(a, sample);
-    int64_t low[Axes];
-    bool touches = true;
-    for (int axis = 0; axis < Axes; ++axis) {
-      low[axis] = s.axis[axis].low;
-      touches = touches && (s.axis[axis].low_inside || s.axis[axis].high_inside);
-    }
-    const int64_t key = touches ? corners.key(divide(sample, a.num_samples), low) : corners.count;
-    items[sample] = uint64_t(key) << corners.number_bits | uint64_t(sample);
+    const int64_t key = corners.key_of(divide(sample, a.num_samples), stencil(a, sample));
+    items[sample] = uint64_t(key < 0 ? corners.count : key) << corners.number_bits | uint64_t(sample);
   }
 }
 
@@ -353,6 +360,67 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
+// --- Scatter with atomics ------------------------------------------------------------------------
+constexpr int64_t kRun = 16;
+
+template <int V, typename T>
+PRED_DEVICE_ONLY void add_pack(T* to, const T (&value)[V]) {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+  if constexpr (std::is_same_v<T, float> && V == 4) {
+    atomicAdd(reinterpret_cast<float4*>(to), make_float4(value[0], value[1], value[2], value[3]));
+    return;
+  }
+#endif
+#pragma unroll
+  for (int v = 0; v < V; ++v) atomicAdd(to + v, value[v]);
+}
+
+template <int kRows, int V, typename S, int Axes>
+__global__ void __launch_bounds__(kThreads)
+    run_kernel(SampleGridArgs<S, Axes> a, LowerCorners<Axes> corners, bool along_direction, int64_t num_samples,
+               int64_t num_runs, int lanes, S* grad_map) {
+  using T = Compute<S>;
+  constexpr int kCorners = 1 << Axes;
+  const Group group(lanes);
+  for (int64_t run = group.first(); run < num_runs; run += group.stride()) {
+    const int64_t first = run * kRun, last = first + kRun < num_samples ? first + kRun : num_samples;
+    for (int64_t c = group.lane * V; c < a.channels; c += group.size * V) {
+      T sum[kCorners][V] = {};
+      S* row[kCorners] = {};
+      int64_t held = -1;  // the cell of `sum` and `row`
+      for (int64_t sample = first; sample <= last; ++sample) {
+        const int64_t map = sample < last ? divide(sample, a.num_samples) : 0;
+        const int64_t key = sample < last ? corners.key_of(map, stencil(a, sample)) : -1;
+        if (key < 0 && sample < last) continue;
+        if (key != held) {
+#pragma unroll
+          for (int k = 0; k < kCorners; ++k) {
+            if (row[k]) add_pack<V>(row[k] + c, sum[k]);
+            for (int v = 0; v < V; ++v) sum[k][v] = 0;
+          }
+          if (sample == last) break;
+          held = key;
+          const Corners<S, Axes> p(grad_map + map * a.stride[Axes], a, stencil(a, sample));
+#pragma unroll
+          for (int k = 0; k < kCorners; ++k) row[k] = const_cast<S*>(p.row[k]);
+        }
+        T weight[kRows][kCorners];
+        scatter_weights<kRows>(a, sample, along_direction, weight);
+#pragma unroll
+        for (int m = 0; m < kRows; ++m) {
+          T value[V];
+          const S* from = gradient_row<kRows>(a, sample, m);
+          load_pack<V>(from ? from + c : nullptr, value);
+#pragma unroll
+          for (int k = 0; k < kCorners; ++k) {
+            for (int v = 0; v < V; ++v) sum[k][v] += weight[m][k] * value[v];
+          }
+        }
+      }
+    }
+  }
+}
+
 // --- Launches ------------------------------------------------------------------------------------
 template <typename S, int Axes>
 void forward(const SampleGridArgs<S, Axes>& a, S* out, S* slopes, int64_t, int64_t num_samples) {
@@ -416,10 +484,37 @@ void scatter(const SampleGridArgs<S, Axes>& a, int64_t batch, bool along_directi
   }
 }
 
+template <int kRows, typename S, int Axes>
+void add_runs(const SampleGridArgs<S, Axes>& a, int64_t batch, bool along_direction, S* grad_map) {
+  const int64_t num_samples = batch * a.num_samples, num_runs = (num_samples + kRun - 1) / kRun;
+  by_pack<S>(in_packs<S>(a.channels, a.grad, a.grad_slopes, a.grad_along, grad_map), a.channels,
+             [&](auto pack, int lanes) {
+               launch_threads(run_kernel<kRows, decltype(pack)::value, S, Axes>, num_runs * lanes, a,
+                              LowerCorners<Axes>(a, batch), along_direction, num_samples, num_runs, lanes, grad_map);
+             });
+}
+
+template <typename S, int Axes>
+void scatter_atomically(const SampleGridArgs<S, Axes>& a, int64_t batch, bool along_direction, S* grad_map) {
+  if (a.grad_along) {
+    add_runs<kAlong>(a, batch, false, grad_map);
+  } else if (a.grad_slopes) {
+    add_runs<1 + Axes>(a, batch, along_direction, grad_map);
+  } else {
+    add_runs<1>(a, batch, along_direction, grad_map);
+  }
+}
+
 template <typename S, int Axes>
 constexpr SampleGridKernels<S, Axes> sample_grid_kernels() {
-  return {forward<S, Axes>,       nullptr,         nullptr, backward_grid<S, Axes>, double_backward<S, Axes>,
-          scatter_bytes<S, Axes>, scatter<S, Axes>};
+  SampleGridKernels<S, Axes> table{};
+  table.forward = forward;
+  table.backward_grid = backward_grid;
+  table.double_backward = double_backward;
+  table.scatter_bytes = scatter_bytes;
+  table.scatter = scatter;
+  if constexpr (std::is_same_v<S, Compute<S>>) table.scatter_atomically = scatter_atomically;
+  return table;
 }
 
 }  // namespace

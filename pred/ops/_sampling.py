@@ -112,17 +112,18 @@ def register(op: str) -> None:
         map_, grid = ctx.saved_tensors
         need_map, need_grid = ctx.needs_input_grad[:2]
         grad_map, grad_grid = getattr(ops, f"{op}_backward")(
-            grad, map_, grid, ctx.border, ctx.align_corners, need_map, need_grid
+            grad, map_, grid, ctx.border, ctx.align_corners, need_map, need_grid, _native.deterministic()
         )
         return grad_map if need_map else None, grad_grid if need_grid else None, None, None
 
     def fake_backward(
-        grad: Tensor, map_: Tensor, grid: Tensor, border: bool, align_corners: bool, need_map: bool, need_grid: bool
-    ) -> tuple[Tensor, Tensor]:
+        grad: Tensor, map_: Tensor, grid: Tensor, border: bool, align_corners: bool, need_map: bool, need_grid: bool,
+        deterministic: bool,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         return _like_map(map_, need_map), _like(grid, need_grid)
 
     def save_backward(ctx: Any, inputs: Any, output: Any) -> None:
-        grad, map_, grid, ctx.border, ctx.align_corners, ctx.need_map, ctx.need_grid = inputs
+        grad, map_, grid, ctx.border, ctx.align_corners, ctx.need_map, ctx.need_grid, _ = inputs
         ctx.save_for_backward(grad, map_, grid)
         ctx.set_materialize_grads(False)
 
@@ -134,11 +135,19 @@ def register(op: str) -> None:
         grad_grad_map = grad_grad_map if ctx.need_map else None
         grad_grad_grid = grad_grad_grid if ctx.need_grid else None
         if grad_grad_map is None and grad_grad_grid is None:
-            return (None,) * 7
+            return (None,) * 8
         grads = getattr(ops, f"{op}_double_backward")(
-            grad_grad_map, grad_grad_grid, grad, map_, grid, ctx.border, ctx.align_corners, *needs
+            grad_grad_map,
+            grad_grad_grid,
+            grad,
+            map_,
+            grid,
+            ctx.border,
+            ctx.align_corners,
+            *needs,
+            _native.deterministic(),
         )
-        return *(value if need else None for value, need in zip(grads, needs, strict=True)), None, None, None, None
+        return (*(value if need else None for value, need in zip(grads, needs, strict=True)), *(None,) * 5)
 
     def fake_double_backward(
         grad_grad_map: Tensor | None,
@@ -151,6 +160,7 @@ def register(op: str) -> None:
         need_grad: bool,
         need_map: bool,
         need_grid: bool,
+        deterministic: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
         return _like(grad, need_grad), _like_map(map_, need_map), _like(grid, need_grid)
 
@@ -171,7 +181,15 @@ def register(op: str) -> None:
         map_, grid = ctx.saved_tensors
         need_map, need_grid = ctx.needs_input_grad[:2]
         grad_map, grad_grid = getattr(ops, f"{op}_with_grad_backward")(
-            grad_values, grad_grads, map_, grid, ctx.border, ctx.align_corners, need_map, need_grid
+            grad_values,
+            grad_grads,
+            map_,
+            grid,
+            ctx.border,
+            ctx.align_corners,
+            need_map,
+            need_grid,
+            _native.deterministic(),
         )
         return grad_map if need_map else None, grad_grid if need_grid else None, None, None
 
@@ -184,6 +202,7 @@ def register(op: str) -> None:
         align_corners: bool,
         need_map: bool,
         need_grid: bool,
+        deterministic: bool,
     ) -> tuple[Tensor, Tensor]:
         return _like_map(map_, need_map), _like(grid, need_grid)
 

@@ -459,7 +459,7 @@ def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
     with torch.autocast(points.device.type, enabled=False):  # which would widen the map and what was kept
         found = torch.ops.pred.decode_field_backward(
             sdf, semantics, gradient if ctx.with_gradient else None, projected, points, parameters, *kept,
-            *ctx.settings, need[0], need[1], need[2],
+            *ctx.settings, need[0], need[1], need[2], _native.deterministic(),
         )  # fmt: skip
     return (*(value if wanted else None for value, wanted in zip(found, need, strict=False)), *none)
 
@@ -481,6 +481,7 @@ def _backward_fake(
     need_projected: bool,
     need_points: bool,
     need_parameters: bool,
+    deterministic: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     frames, count = points.shape[:2]
     return (

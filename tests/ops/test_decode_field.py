@@ -214,7 +214,7 @@ def test_recomputing_changes_rounding_only(precision: str, with_gradient: bool, 
 
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
-def test_bitwise_equal_for_any_thread_count(precision: str, level: str) -> None:
+def test_bitwise_equal_for_any_thread_count(deterministic: None, precision: str, level: str) -> None:
     case = make(count=4000, frames=1).to(torch.float32)
     found = []
     for threads in (1, 2, 7):
@@ -258,7 +258,7 @@ def test_parts_of_the_derivative(
     assert_all_close(gradients(decode_field, recompute=recompute), gradients(reference.decode_field), 1e-11)
 
 
-def test_autocast_around_the_backward_pass_changes_no_bit(native: None) -> None:
+def test_autocast_around_the_backward_pass_changes_no_bit(native: None, deterministic: None) -> None:
     case = make().to(torch.float32)
     plain = results(case, with_gradient=True, precision="bf16")
     with torch.autocast("cpu", torch.bfloat16):
@@ -459,5 +459,5 @@ def test_direct_calls_are_checked(native: None) -> None:
     with pytest.raises(KERNEL_ERROR, match=r"decode_field_backward: grad_sdf must have shape \[1, 5\], got \[1, 4\]"):
         torch.ops.pred.decode_field_backward(
             points[:, 1:, 0], None, None, bev, points, parameters, *[torch.zeros(0, 0, 0)] * 2, *settings,
-            True, True, True,
+            True, True, True, True,
         )  # fmt: skip

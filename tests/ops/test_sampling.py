@@ -248,18 +248,22 @@ def test_opcheck(native: None, sampler: Sampler, samples: int, dtype: torch.dtyp
         tensor.requires_grad_(differentiable)
     torch.library.opcheck(sampler.native(), (volume, grid, False, False))
     torch.library.opcheck(sampler.native("_with_grad"), (volume, grid, False, False))
-    torch.library.opcheck(sampler.native("_backward"), (grad, volume, grid, True, False, True, True))
+    torch.library.opcheck(sampler.native("_backward"), (grad, volume, grid, True, False, True, True, True))
     # Their own derivatives are refused, so their inputs carry none here.
     volume, grid, grad = volume.detach(), grid.detach(), grad.detach()
     for of_map, of_grid in [(volume, grid), (None, grid), (volume, None)]:
-        arguments = (of_map, of_grid, grad, volume, grid, False, False, True, True, True)
+        arguments = (of_map, of_grid, grad, volume, grid, False, False, True, True, True, True)
         torch.library.opcheck(sampler.native("_double_backward"), arguments)
     for some in [(grad, grads), (None, grads), (grad, None)]:
-        torch.library.opcheck(sampler.native("_with_grad_backward"), (*some, volume, grid, False, False, True, True))
+        torch.library.opcheck(
+            sampler.native("_with_grad_backward"), (*some, volume, grid, False, False, True, True, True)
+        )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_bitwise_equal_for_any_thread_count(native: None, sampler: Sampler, dtype: torch.dtype) -> None:
+def test_bitwise_equal_for_any_thread_count(
+    native: None, deterministic: None, sampler: Sampler, dtype: torch.dtype
+) -> None:
     volume, grid = case((2, 33, *(4, 40, 30)[-sampler.axes :]), 5000)
     volume, grid = volume.to(dtype), grid.float()
     results = []
@@ -340,9 +344,9 @@ def test_half_is_float32_rounded_once(level: str, sampler: Sampler, dtype: torch
     for name, arguments in {
         "": (volume, grid, False, False),
         "_with_grad": (volume, grid, True, False),
-        "_backward": (grad, volume, grid, False, True, True, True),
-        "_with_grad_backward": (grad, grads, volume, grid, True, True, True, True),
-        "_double_backward": (of_map, of_grid, grad, volume, grid, False, False, True, True, True),
+        "_backward": (grad, volume, grid, False, True, True, True, True),
+        "_with_grad_backward": (grad, grads, volume, grid, True, True, True, True, True),
+        "_double_backward": (of_map, of_grid, grad, volume, grid, False, False, True, True, True, True),
     }.items():
         wide = [value.float() if isinstance(value, Tensor) else value for value in arguments]
         actual, expected = sampler.native(name)(*arguments), sampler.native(name)(*wide)
@@ -474,9 +478,9 @@ def test_direct_calls_are_checked(native: None, sampler: Sampler) -> None:
         sampler.native()(volume.half(), grid, False, False)
     with pytest.raises(KERNEL_ERROR, match=f"{sampler.op}_backward: grad must have shape \\[2, 23, .\\], got"):
         sampler.native("_backward")(
-            torch.zeros(2, 22, volume.shape[1]).double(), volume, grid, False, False, True, True
+            torch.zeros(2, 22, volume.shape[1]).double(), volume, grid, False, False, True, True, True
         )
     with pytest.raises(KERNEL_ERROR, match=f"{sampler.op}_with_grad_backward: grad_grads must have 4 dimensions"):
-        sampler.native("_with_grad_backward")(None, volume[0, 0], volume, grid, False, False, True, True)
+        sampler.native("_with_grad_backward")(None, volume[0, 0], volume, grid, False, False, True, True, True)
     with pytest.raises(KERNEL_ERROR, match=f"{sampler.op}_with_grad_backward: one gradient must be given"):
-        sampler.native("_with_grad_backward")(None, None, volume, grid, False, False, True, True)
+        sampler.native("_with_grad_backward")(None, None, volume, grid, False, False, True, True, True)
