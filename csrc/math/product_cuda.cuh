@@ -6,7 +6,7 @@
 // multiplied and added one by one.
 //
 // A block owns a tile of kTileM x kTileN results, its warps pieces of it. Both factors go through shared memory in
-// stages; the next stage is fetched while this one is multiplied. Sums over k are made in one order.
+// stages; the next ones are fetched while one is multiplied. Sums over k are made in one order.
 #pragma once
 
 #include <type_traits>
@@ -21,7 +21,7 @@
 namespace pred::PRED_ISA {
 namespace {
 
-constexpr int kTileM = 128, kTileN = 128, kProductThreads = 256;
+constexpr int kTileM = 128, kTileN = 128, kProductThreads = 256, kStages = 3;
 constexpr int kWarpM = 64, kWarpN = 32;  // results of a warp: 4 x 4 pieces of 16 x 8
 constexpr int kPiecesM = kWarpM / 16, kPiecesN = kWarpN / 8;
 
@@ -44,8 +44,8 @@ struct ProductRows {
 // A shared tile: rows of a factor side by side. Inner: [128][kTileK], k along the row. Outer: [kTileK][128].
 template <typename S, bool kOuter>
 struct alignas(16) SharedTile {
-  // Padding keeps the lanes of a fragment in different banks.
-  static constexpr int kRow = kOuter ? kTileM + kChunk<S> : kTileK<S> + kChunk<S>;
+  // Padding keeps the rows (inner) and elements (outer) of a fragment in different banks.
+  static constexpr int kRow = kOuter ? kTileM + 8 : kTileK<S> + kChunk<S>;
   static constexpr int kRows = kOuter ? kTileK<S> : kTileM;
   static constexpr int kChunksPerRow = kOuter ? kTileM / kChunk<S> : kTileK<S> / kChunk<S>;
   static constexpr int kChunks = kRows * kChunksPerRow;
@@ -56,21 +56,23 @@ struct alignas(16) SharedTile {
 };
 
 // --- Tensor cores --------------------------------------------------------------------------------
-// d += a b for one piece, in the layout of the instructions: lane 4 g + t has d of rows g and g + 8, columns 2 t and
-// 2 t + 1.
+// mma_...: d += a b for one piece, in the layout of the instructions: lane 4 g + t has d of rows g and g + 8, columns
+// 2 t and 2 t + 1.
+// load_matrices: four matrices of 8 x 8 pairs of bytes in shared memory, of which lane 8 i + r names row r of matrix i
+// (16 bytes, aligned). Lane 4 g + t gets elements 2 t and 2 t + 1 of row g of each, or of column g of its transpose.
 #if !defined(__CUDACC__)
 constexpr bool kTensorCores = true;
 
 // Emulated: the lanes give each other their fragments.
 template <int kDepth, class Multiply>
-inline void emulate_mma(float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2], const Multiply& multiply) {
+inline void emulate_mma(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1, const Multiply& multiply) {
   uint32_t all_a[4][kWarp], all_b[2][kWarp];
   for (int i = 0; i < 4; ++i) {
     const uint64_t* lanes = emulation::exchange(a[i]);
     for (int lane = 0; lane < kWarp; ++lane) all_a[i][lane] = uint32_t(lanes[lane]);
   }
   for (int i = 0; i < 2; ++i) {
-    const uint64_t* lanes = emulation::exchange(b[i]);
+    const uint64_t* lanes = emulation::exchange(i ? b1 : b0);
     for (int lane = 0; lane < kWarp; ++lane) all_b[i][lane] = uint32_t(lanes[lane]);
   }
   const int g = int(threadIdx.x % kWarp) / 4, t = int(threadIdx.x % kWarp) % 4;
@@ -82,106 +84,136 @@ inline void emulate_mma(float (&d)[4], const uint32_t (&a)[4], const uint32_t (&
     }
   }
 }
-inline void mma_bfloat16(float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]) {
-  emulate_mma<16>(d, a, b, [](uint32_t x, uint32_t y) {
+inline void mma_bfloat16(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
+  emulate_mma<16>(d, a, b0, b1, [](uint32_t x, uint32_t y) {
     return widen_bfloat16<float>(x & 0xffffu) * widen_bfloat16<float>(y & 0xffffu) +
            bits_as<float>(x & 0xffff0000u) * bits_as<float>(y & 0xffff0000u);
   });
 }
-inline void mma_tf32(float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]) {
-  emulate_mma<8>(d, a, b, [](uint32_t x, uint32_t y) {
+inline void mma_tf32(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
+  emulate_mma<8>(d, a, b0, b1, [](uint32_t x, uint32_t y) {
     return bits_as<float>(x & 0xffffe000u) * bits_as<float>(y & 0xffffe000u);
   });
+}
+template <bool kTranspose>
+inline void load_matrices(const void* row, uint32_t (&to)[4]) {
+  const uint64_t* rows = emulation::exchange(emulation::to_bits(row));
+  const int g = lane_number() / 4, t = lane_number() % 4;
+  for (int i = 0; i < 4; ++i) {
+    const auto element = [&](int r, int c) {
+      return uint32_t(emulation::from_bits<const uint16_t*>(rows[8 * i + r])[c]);
+    };
+    to[i] =
+        kTranspose ? element(2 * t, g) | element(2 * t + 1, g) << 16 : element(g, 2 * t) | element(g, 2 * t + 1) << 16;
+  }
 }
 #elif !defined(__CUDA_ARCH__) || __CUDA_ARCH__ >= 800
 constexpr bool kTensorCores = true;
 
-PRED_DEVICE_ONLY void mma_bfloat16(float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]) {
+PRED_DEVICE_ONLY void mma_bfloat16(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
   asm("mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
       : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
-      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b[0]), "r"(b[1]));
+      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
 }
-PRED_DEVICE_ONLY void mma_tf32(float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]) {
+PRED_DEVICE_ONLY void mma_tf32(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
   asm("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
       : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
-      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b[0]), "r"(b[1]));
+      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+}
+template <bool kTranspose>
+PRED_DEVICE_ONLY void load_matrices(const void* row, uint32_t (&to)[4]) {
+  const uint32_t address = uint32_t(__cvta_generic_to_shared(row));
+  if constexpr (kTranspose) {
+    asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0,%1,%2,%3}, [%4];"
+                 : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
+                 : "r"(address)
+                 : "memory");
+  } else {
+    asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0,%1,%2,%3}, [%4];"
+                 : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
+                 : "r"(address)
+                 : "memory");
+  }
 }
 #else
 constexpr bool kTensorCores = false;
-PRED_DEVICE_ONLY void mma_bfloat16(float (&)[4], const uint32_t (&)[4], const uint32_t (&)[2]) {}
-PRED_DEVICE_ONLY void mma_tf32(float (&)[4], const uint32_t (&)[4], const uint32_t (&)[2]) {}
+PRED_DEVICE_ONLY void mma_bfloat16(float (&)[4], const uint32_t (&)[4], uint32_t, uint32_t) {}
+PRED_DEVICE_ONLY void mma_tf32(float (&)[4], const uint32_t (&)[4], uint32_t, uint32_t) {}
+template <bool kTranspose>
+PRED_DEVICE_ONLY void load_matrices(const void*, uint32_t (&)[4]) {}
 #endif
 
-// The nearest number of 11 bits.
-PRED_DEVICE_ONLY float round_tf32(float x) {
-  return x == x ? bits_as<float>((bits_as<uint32_t>(x) + 0x1000u) & 0xffffe000u) : x;
+// Of results [row, row + 16), k from `k` on over 32 bytes.
+template <typename S, bool kOuter>
+PRED_DEVICE_ONLY void load_left(const SharedTile<S, kOuter>& tile, int row, int k, uint32_t (&a)[4]) {
+  const int lane = lane_number();
+  if constexpr (!kOuter) {
+    load_matrices<false>(&tile.x[row + lane % 16][k + lane / 16 * kChunk<S>], a);
+  } else if constexpr (std::is_same_v<S, BFloat16>) {
+    load_matrices<true>(&tile.x[k + lane % 8 + lane / 16 * 8][row + lane / 8 % 2 * 8], a);
+  } else {
+    for (int i = 0; i < 4; ++i) a[i] = bits_as<uint32_t>(tile.x[k + lane % 4 + i / 2 * 4][row + lane / 4 + i % 2 * 8]);
+  }
 }
 
-template <int N>
-struct SplitFragment {
-  uint32_t high[N], low[N];
-
-  __device__ void set(int i, float x) {
-    const float rounded = round_tf32(x);
-    high[i] = bits_as<uint32_t>(rounded);
-    low[i] = bits_as<uint32_t>(x == rounded ? 0.0f : round_tf32(x - rounded));  // infinity has no rest
+// Of results [column, column + 16): two pieces of two each.
+template <typename S, bool kOuter>
+PRED_DEVICE_ONLY void load_right(const SharedTile<S, kOuter>& tile, int column, int k, uint32_t (&b)[4]) {
+  const int lane = lane_number();
+  if constexpr (!kOuter) {
+    load_matrices<false>(&tile.x[column + lane % 8 + lane / 16 * 8][k + lane / 8 % 2 * kChunk<S>], b);
+  } else if constexpr (std::is_same_v<S, BFloat16>) {
+    load_matrices<true>(&tile.x[k + lane % 16][column + lane / 16 * 8], b);
+  } else {
+    for (int i = 0; i < 4; ++i)
+      b[i] = bits_as<uint32_t>(tile.x[k + lane % 4 + i % 2 * 4][column + lane / 4 + i / 2 * 8]);
   }
-};
+}
 
-template <bool kOuter>
-PRED_DEVICE_ONLY uint32_t pair_of(const SharedTile<BFloat16, kOuter>& tile, int i, int k) {
-  return uint32_t(tile.at(i, k).bits) | uint32_t(tile.at(i, k + 1).bits) << 16;
+// Numbers of 24 bits as sums of two, of which the instructions read 11 bits each. NaN and infinity give NaN.
+PRED_DEVICE_ONLY void split_tf32(uint32_t (&x)[4], uint32_t (&rest)[4]) {
+#pragma unroll
+  for (int i = 0; i < 4; ++i) {
+    const uint32_t nearest = (x[i] + 0x1000u) & 0xffffe000u;
+    rest[i] = bits_as<uint32_t>(bits_as<float>(x[i]) - bits_as<float>(nearest));
+    x[i] = nearest;
+  }
 }
 
 // One stage: sum += rows [row0, row0 + kWarpM) of `left` times rows [column0, column0 + kWarpN) of `right`.
 template <typename S, bool kOuter, typename T = Compute<S>>
 PRED_DEVICE_ONLY void multiply_stage(const SharedTile<S, kOuter>& left, const SharedTile<S, kOuter>& right, int row0,
                                      int column0, T (&sum)[kPiecesM][kPiecesN][4]) {
-  const int g = lane_number() / 4, t = lane_number() % 4;
-  if constexpr (kTensorCores && std::is_same_v<S, BFloat16>) {
+  static_assert(std::is_same_v<S, BFloat16> || std::is_same_v<S, float> || std::is_same_v<S, double>);
+  if constexpr (kTensorCores && !std::is_same_v<S, double>) {
 #pragma unroll
-    for (int k = 0; k < kTileK<S>; k += 16) {
-      uint32_t b[kPiecesN][2];
+    for (int k = 0; k < kTileK<S>; k += 2 * kChunk<S>) {
+      uint32_t b[kPiecesN / 2][4], b_rest[kPiecesN / 2][4];
 #pragma unroll
-      for (int j = 0; j < kPiecesN; ++j) {
-        b[j][0] = pair_of(right, column0 + 8 * j + g, k + 2 * t);
-        b[j][1] = pair_of(right, column0 + 8 * j + g, k + 2 * t + 8);
+      for (int j = 0; j < kPiecesN / 2; ++j) {
+        load_right(right, column0 + 16 * j, k, b[j]);
+        if constexpr (std::is_same_v<S, float>) split_tf32(b[j], b_rest[j]);
       }
 #pragma unroll
       for (int i = 0; i < kPiecesM; ++i) {
-        const int row = row0 + 16 * i + g;
-        const uint32_t a[4] = {pair_of(left, row, k + 2 * t), pair_of(left, row + 8, k + 2 * t),
-                               pair_of(left, row, k + 2 * t + 8), pair_of(left, row + 8, k + 2 * t + 8)};
-#pragma unroll
-        for (int j = 0; j < kPiecesN; ++j) mma_bfloat16(sum[i][j], a, b[j]);
-      }
-    }
-  } else if constexpr (kTensorCores && std::is_same_v<S, float>) {
-#pragma unroll
-    for (int k = 0; k < kTileK<S>; k += 8) {
-      SplitFragment<2> b[kPiecesN];
-#pragma unroll
-      for (int j = 0; j < kPiecesN; ++j) {
-        b[j].set(0, right.at(column0 + 8 * j + g, k + t));
-        b[j].set(1, right.at(column0 + 8 * j + g, k + t + 4));
-      }
-#pragma unroll
-      for (int i = 0; i < kPiecesM; ++i) {
-        const int row = row0 + 16 * i + g;
-        SplitFragment<4> a;
-        a.set(0, left.at(row, k + t));
-        a.set(1, left.at(row + 8, k + t));
-        a.set(2, left.at(row, k + t + 4));
-        a.set(3, left.at(row + 8, k + t + 4));
+        uint32_t a[4], a_rest[4];
+        load_left(left, row0 + 16 * i, k, a);
+        if constexpr (std::is_same_v<S, float>) split_tf32(a, a_rest);
 #pragma unroll
         for (int j = 0; j < kPiecesN; ++j) {
-          mma_tf32(sum[i][j], a.low, b[j].high);
-          mma_tf32(sum[i][j], a.high, b[j].low);
-          mma_tf32(sum[i][j], a.high, b[j].high);
+          const int at = j % 2 * 2;
+          if constexpr (std::is_same_v<S, float>) {
+            mma_tf32(sum[i][j], a_rest, b[j / 2][at], b[j / 2][at + 1]);
+            mma_tf32(sum[i][j], a, b_rest[j / 2][at], b_rest[j / 2][at + 1]);
+            mma_tf32(sum[i][j], a, b[j / 2][at], b[j / 2][at + 1]);
+          } else {
+            mma_bfloat16(sum[i][j], a, b[j / 2][at], b[j / 2][at + 1]);
+          }
         }
       }
     }
   } else {
+    const int g = lane_number() / 4, t = lane_number() % 4;
     for (int k = 0; k < kTileK<S>; ++k) {
       T b[kPiecesN][2];
 #pragma unroll
@@ -249,11 +281,11 @@ constexpr int kMostSparseSegments = 512;
 // gets (row, column, split, value, value of the next column), for rows below m and columns below n, from one thread
 // each.
 template <typename S, bool kOuter, class Left, class Right, class Epilogue>
-__global__ void __launch_bounds__(kProductThreads)
+__global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1 : 2)
     product_kernel(ProductSizes sizes, Left left, Right right, Epilogue epilogue) {
   using T = Compute<S>;
   using Tile = SharedTile<S, kOuter>;
-  __shared__ Tile tiles[2][2];  // stage, factor
+  auto* const tiles = static_cast<Tile(*)[2]>(dynamic_shared());  // [kStages], one per factor
   const int64_t tiles_n = (sizes.n + kTileN - 1) / kTileN, tiles_m = (sizes.m + kTileM - 1) / kTileM;
   const int warp = int(threadIdx.x) / kWarp;
   __shared__ int used[Left::kSparse ? kMostSparseSegments : 1], num_used;
@@ -282,12 +314,14 @@ __global__ void __launch_bounds__(kProductThreads)
       __syncthreads();
     }
     const int64_t steps = (step1 - step0) * (by_list ? num_used : sizes.segments);
-    const auto fetch = [&](int64_t step) {
-      const int place = int(step / (step1 - step0)), segment = by_list ? used[place] : place;
-      const int64_t k0 = (step0 + step % (step1 - step0)) * kTileK<S>;
+    int place = 0, to_fill = 0;  // of the next stage that is fetched: among the segments, and in `tiles`
+    int64_t next_step = step0;
+    const auto fetch = [&] {
+      const int segment = by_list ? used[place] : place;
+      const int64_t k0 = next_step * kTileK<S>;
 #pragma unroll
       for (int factor = 0; factor < 2; ++factor) {
-        Tile& to = tiles[step % 2][factor];
+        Tile& to = tiles[to_fill][factor];
         const int64_t first = factor ? first_n : first_m, size = factor ? sizes.n : sizes.m;
 #pragma unroll
         for (int chunk = int(threadIdx.x); chunk < Tile::kChunks; chunk += kProductThreads) {
@@ -298,20 +332,26 @@ __global__ void __launch_bounds__(kProductThreads)
           copy_chunk(&to.x[i][c], from ? from + column : nullptr);
         }
       }
-      commit_copies();
+      to_fill = to_fill + 1 < kStages ? to_fill + 1 : 0;
+      if (++next_step == step1) {
+        next_step = step0;
+        ++place;
+      }
     };
     T sum[kPiecesM][kPiecesN][4] = {};
-    if (steps > 0) fetch(0);
+#pragma unroll
+    for (int stage = 0; stage < kStages - 1; ++stage) {
+      if (stage < steps) fetch();
+      commit_copies();  // of nothing, too: the waiting below counts commits
+    }
+    int stage = 0;
     for (int64_t step = 0; step < steps; ++step) {
-      if (step + 1 < steps) {
-        fetch(step + 1);
-        wait_for_copies<1>();
-      } else {
-        wait_for_copies<0>();
-      }
-      __syncthreads();
-      multiply_stage<S, kOuter>(tiles[step % 2][0], tiles[step % 2][1], row0, column0, sum);
-      __syncthreads();
+      wait_for_copies<kStages - 2>();
+      __syncthreads();  // this stage is there, and the one before has been read
+      if (step + kStages - 1 < steps) fetch();
+      commit_copies();
+      multiply_stage<S, kOuter>(tiles[stage][0], tiles[stage][1], row0, column0, sum);
+      stage = stage + 1 < kStages ? stage + 1 : 0;
     }
     const int64_t row = first_m + row0 + lane_number() / 4, column = first_n + column0 + lane_number() % 4 * 2;
 #pragma unroll
@@ -324,15 +364,15 @@ __global__ void __launch_bounds__(kProductThreads)
         }
       }
     }
-    if (by_list) __syncthreads();  // all have read the list
+    __syncthreads();  // all have read the last stage and the list
   }
 }
 
 template <typename S, bool kOuter, class Left, class Right, class Epilogue>
 void launch_product(const ProductSizes& sizes, const Left& left, const Right& right, const Epilogue& epilogue) {
   const int64_t tiles = (sizes.m + kTileM - 1) / kTileM * ((sizes.n + kTileN - 1) / kTileN) * sizes.splits;
-  launch_blocks(product_kernel<S, kOuter, Left, Right, Epilogue>, tiles, kProductThreads, 0, sizes, left, right,
-                epilogue);
+  launch_blocks(product_kernel<S, kOuter, Left, Right, Epilogue>, tiles, kProductThreads,
+                2 * kStages * int64_t(sizeof(SharedTile<S, kOuter>)), sizes, left, right, epilogue);
 }
 
 // --- Around products -----------------------------------------------------------------------------
