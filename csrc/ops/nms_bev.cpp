@@ -38,7 +38,7 @@ Tensor nms_rows(const Tensor& boxes, const Tensor& scores, double iou_threshold,
   const T* data = boxes.const_data_ptr<T>();
   const std::vector<int64_t> rows = ordered_rows(data, scores.const_data_ptr<T>(), boxes.size(0), pre_max);
   const int64_t count = int64_t(rows.size());
-  const BoxColumns candidates(count), kept(std::min(count, post_max));
+  const BoxColumns candidates(boxes, count), kept(boxes, std::min(count, post_max));
   parallel(count, 512, [&](int64_t begin, int64_t end) {
     for (int64_t n = begin; n < end; ++n) put_box(candidates.table(), n, read_box(data + 7 * rows[n]));
   });
