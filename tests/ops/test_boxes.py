@@ -16,7 +16,7 @@ from benchmarks import memory
 from benchmarks.cases import lidar_points
 from pred.data.boxes import corners_bev
 from pred.ops import box_iou_3d, box_iou_bev, nms_bev, points_in_boxes, points_in_boxes_mask, reference
-from tests.conftest import KERNEL_ERROR, SANITIZED
+from tests.conftest import KERNEL_ERROR, SANITIZED, require_value_checks
 from tests.tolerances import FORWARD
 
 F64 = torch.float64
@@ -476,6 +476,18 @@ def test_points_of_a_scan_at_every_level(level: str, dtype: torch.dtype) -> None
         assert torch.equal(points_in_boxes(points, boxes, frames, box_frames), expected)
 
 
+def test_more_boxes_than_a_tile(native: None) -> None:
+    """In frames that begin and end within blocks of points and tiles of boxes; few points are in none."""
+    boxes = random_boxes(300, spread=8)
+    points = (torch.rand(700, 3, generator=torch.Generator().manual_seed(0), dtype=F64) - 0.5) * 16
+    frames, box_frames = torch.tensor([0, 3, 3, 200, 450, 700]), torch.tensor([0, 130, 131, 131, 231, 300])
+    assert torch.equal(points_in_boxes_mask(points, boxes), reference.points_in_boxes_mask(points, boxes))
+    for offsets in ((), (frames, box_frames)):
+        found = points_in_boxes(points, boxes, *offsets)
+        assert torch.equal(found, reference.points_in_boxes(points, boxes, *offsets))
+        assert 64 < found.max() < 300 and (found == -1).any()
+
+
 def test_points_on_faces_of_lattice_boxes_are_inside(level: str) -> None:
     """Numbers that are exact: bounds of tiles cut nothing off."""
     grid = torch.arange(-12, 13, dtype=torch.float32) / 4
@@ -571,9 +583,14 @@ def test_direct_calls_are_checked(native: None) -> None:
         call.nms_bev(boxes, boxes[:, 0], 0.5, None, -2)
     with pytest.raises(KERNEL_ERROR, match=r"nms_bev: scores must have shape \[2\], got \[3\]"):
         call.nms_bev(boxes, points[:, 0], 0.5, None, None)
-    with pytest.raises(KERNEL_ERROR, match="points_in_boxes: box_offsets must ascend from 0 to M=2"):
-        call.points_in_boxes(points, boxes, torch.tensor([0, 3]), torch.tensor([0, 5]))
     with pytest.raises(KERNEL_ERROR, match="points_in_boxes: box_offsets must come with batch_offsets"):
         call.points_in_boxes(points, boxes, torch.tensor([0, 3]), None)
     with pytest.raises(KERNEL_ERROR, match=r"points_in_boxes_mask: points must have shape \[N, 3\], got \[3, 2\]"):
         call.points_in_boxes_mask(points[:, :2], boxes)
+
+
+def test_offsets_are_checked(native: None) -> None:
+    require_value_checks("native")
+    boxes, points = boxes_of(box(), box()), torch.zeros(3, 3, dtype=F64)
+    with pytest.raises(KERNEL_ERROR, match="points_in_boxes: box_offsets must ascend from 0 to M=2"):
+        torch.ops.pred.points_in_boxes(points, boxes, torch.tensor([0, 3]), torch.tensor([0, 5]))
