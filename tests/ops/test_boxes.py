@@ -378,6 +378,28 @@ def test_suppression_is_its_definition(backend: str, count: int) -> None:
         assert nms_bev(boxes.float(), scores.float(), threshold, None, 300).tolist() == expected[:300]
 
 
+def test_suppression_of_thousands_of_boxes(native: None) -> None:
+    """More than one round of the kernels that are launched takes; what is kept is known beforehand."""
+    # In a row 1 m apart, the scores falling: 1 m and 2 m are suppressed, 3 m has an IoU of 1/7.
+    rows = torch.arange(9001)
+    boxes = boxes_of(box()).repeat(9001, 1)
+    boxes[:, 0] = rows.double()
+    order = torch.randperm(9001, generator=torch.Generator().manual_seed(0))
+    place = order.argsort()
+    kept = order[::3]
+    assert torch.equal(nms_bev(boxes[place], -place.double(), 0.3), kept)
+    assert torch.equal(nms_bev(boxes[place], -place.double(), 0.3, 5000, 1600), kept[:1600])
+    assert torch.equal(nms_bev(boxes[place], -place.double(), 0.3, 5000), kept[:1667])
+    # Around 1500 places far from each other; of many equal scores the lowest row is the best one.
+    boxes[:, 0] = 20.0 * (rows % 1500) + 0.01 * (rows // 1500)
+    scores = torch.randint(0, 60, (9001,), generator=torch.Generator().manual_seed(1)).float()
+    best: dict[int, int] = {}
+    for row in sorted(rows.tolist(), key=lambda row: (-float(scores[row]), row)):
+        best.setdefault(row % 1500, row)
+    assert nms_bev(boxes.float(), scores, 0.5).tolist() == list(best.values())
+    assert nms_bev(boxes.float(), scores, 0.5, post_max=700).tolist() == list(best.values())[:700]
+
+
 def test_suppression_at_every_level_and_with_any_number_of_threads(level: str) -> None:
     boxes, scores = random_boxes(1200, spread=15), torch.rand(1200, generator=torch.Generator().manual_seed(3)).double()
     expected = reference.nms_bev(boxes, scores, 0.1)
