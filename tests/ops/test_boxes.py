@@ -261,7 +261,9 @@ def test_native_is_the_reference_on_awkward_boxes(level: str, dtype: torch.dtype
         for aligned in (False, True):
             iou, expected = op(a, b, aligned), getattr(reference, name)(a.double(), b.double(), aligned)
             assert (iou.double() - expected).abs().max() <= FORWARD[dtype]
-            assert torch.equal(iou > 0, expected > 0) or dtype == torch.float32
+            # Whether boxes with a common side overlap is up to the roundings of sines.
+            overlap = torch.maximum(iou.double(), expected) > 1e-14
+            assert torch.equal(iou[overlap] > 0, expected[overlap] > 0) or dtype == torch.float32
 
 
 class SpconvBoxes:
