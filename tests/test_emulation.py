@@ -88,3 +88,7 @@ def test_wrong_offsets_touch_no_memory_of_others(native: None, offsets: list[int
     for most in (1, 100):  # per frame
         table, _, counts, slots = torch.ops.pred.voxelize_hard(points, rays, *grid, samples, most)
         assert table.shape[0] >= 1 and counts.sum() == (slots >= 0).sum()
+    boxes = torch.tensor([[0.5, 0.5, 0.5, 9, 9, 9, 0]]).repeat(200, 1)
+    for box_offsets in (rays, rays.flip(0)):
+        inside = torch.ops.pred.points_in_boxes(points, boxes, rays, box_offsets)
+        assert ((inside >= -1) & (inside < 200)).all()

@@ -7,6 +7,7 @@
 #pragma once
 
 #include "common/host_device.h"
+#include "math/sine_cosine.h"
 
 namespace pred {
 
@@ -55,27 +56,21 @@ PRED_HOST_DEVICE Box no_box() {
   return box;
 }
 
+PRED_HOST_DEVICE double lesser(double a, double b) { return a < b ? a : b; }
+PRED_HOST_DEVICE double greater(double a, double b) { return a > b ? a : b; }
+
+// The same bits on every machine, but for a yaw of 2^20 and more: that is left to the library.
 template <typename T>
 PRED_HOST_DEVICE Box read_box(const T row[7]) {
   if (!is_box(row)) return no_box();
-  Box box{double(row[0]),
-          double(row[1]),
-          double(row[2]),
-          double(row[3]) / 2,
-          double(row[4]) / 2,
-          double(row[5]) / 2,
-          double(row[6]),
-          0,
-          0};
-  const double yaw = box.cos;
-  box.cos = __builtin_cos(yaw);
-  box.sin = __builtin_sin(yaw);
-  box.reach = __builtin_hypot(box.half_length, box.half_width);
-  return box;
+  const double half_length = double(row[3]) / 2, half_width = double(row[4]) / 2, yaw = double(row[6]);
+  const bool is_usual = __builtin_fabs(yaw) < 0x1p20;
+  const SineCosine turn = is_usual ? sine_cosine(yaw) : SineCosine{__builtin_sin(yaw), __builtin_cos(yaw)};
+  const double longer = greater(half_length, half_width), ratio = lesser(half_length, half_width) / longer;
+  const double reach = longer > 0 ? longer * __builtin_sqrt(1 + ratio * ratio) : 0;
+  return {double(row[0]),     double(row[1]), double(row[2]), half_length, half_width,
+          double(row[5]) / 2, turn.cosine,    turn.sine,      reach};
 }
-
-PRED_HOST_DEVICE double lesser(double a, double b) { return a < b ? a : b; }
-PRED_HOST_DEVICE double greater(double a, double b) { return a > b ? a : b; }
 
 // Faces belong to the box. False for a point or a box that is not finite.
 PRED_HOST_DEVICE bool contains(const Box& box, double x, double y, double z) {

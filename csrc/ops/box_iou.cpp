@@ -44,7 +44,7 @@ Tensor box_iou_3d(const Tensor& boxes_a, const Tensor& boxes_b, bool aligned) {
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) {
-  m.impl("box_iou_bev", TORCH_BOX(&pred::box_iou_bev));
-  m.impl("box_iou_3d", TORCH_BOX(&pred::box_iou_3d));
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) {
+  PRED_IMPL(m, "box_iou_bev", &pred::box_iou_bev);
+  PRED_IMPL(m, "box_iou_3d", &pred::box_iou_3d);
 }

@@ -10,7 +10,7 @@
 namespace pred {
 
 template <typename T>
-struct BoxIouKernels {
+struct BoxIouKernels {  // those that are launched do everything, whatever the range
   // Groups of kBoxLanes boxes b, those of row 0 of a first: number n is group n % groups of row n / groups. out: [N,
   // M].
   void (*all_pairs)(const BoxTable& a, const BoxTable& b, bool with_height, T* out, int64_t begin, int64_t end);

@@ -6,6 +6,7 @@
 #include "common/allocate.h"
 #include "common/tile.h"
 #include "math/product.h"
+#include "math/sine_cosine.h"
 #include "math/softplus.h"
 #include "ops/decode_field.h"
 #include "ops/sample_grid_cpu.h"

@@ -7,6 +7,7 @@
 // lanes per sample (gathers), one warp per sample (gradients by the position).
 #include "common/workspace.h"
 #include "math/product_cuda.cuh"
+#include "math/sine_cosine.h"
 #include "math/softplus.h"
 #include "ops/decode_field.h"
 #include "ops/sample_grid_rows.cuh"

@@ -15,6 +15,24 @@
 namespace pred {
 namespace {
 
+#ifdef PRED_LAUNCH
+PRED_KERNELS_BY_TYPE(NmsBevKernels, nms_bev)
+
+template <typename T>
+Tensor nms_rows(const Tensor& boxes, const Tensor& scores, double iou_threshold, int64_t pre_max, int64_t post_max) {
+  NmsBevSizes sizes{boxes.size(0), std::min(boxes.size(0), pre_max), 0};
+  sizes.kept = std::min(sizes.candidates, post_max);
+  PRED_CHECK(sizes.boxes < int64_t(1) << 31, "nms_bev: boxes must have fewer than 2^31 rows, got ", sizes.boxes);
+  if (sizes.kept == 0) return torch::stable::new_empty(boxes, {0}, ScalarType::Long);
+  const NmsBevKernels<T>& k = nms_bev_kernels<T>();
+  const Tensor workspace = torch::stable::new_empty(boxes, {k.workspace_bytes(sizes)}, ScalarType::Byte);
+  char* space = mutable_storage<char>(workspace);
+  const int64_t num_kept = k.keep(boxes.const_data_ptr<T>(), scores.const_data_ptr<T>(), iou_threshold, sizes, space);
+  Tensor out = torch::stable::new_empty(boxes, {num_kept}, ScalarType::Long);
+  k.write(sizes, num_kept, out.mutable_data_ptr<int64_t>(), space);
+  return out;
+}
+#else
 // The candidates: rows of boxes with a score, at most `most` of them, highest scores first, then lowest rows.
 template <typename T>
 std::vector<int64_t> ordered_rows(const T* boxes, const T* scores, int64_t count, int64_t most) {
@@ -38,7 +56,7 @@ Tensor nms_rows(const Tensor& boxes, const Tensor& scores, double iou_threshold,
   const T* data = boxes.const_data_ptr<T>();
   const std::vector<int64_t> rows = ordered_rows(data, scores.const_data_ptr<T>(), boxes.size(0), pre_max);
   const int64_t count = int64_t(rows.size());
-  const BoxColumns candidates(count), kept(std::min(count, post_max));
+  const BoxColumns candidates(boxes, count), kept(boxes, std::min(count, post_max));
   parallel(count, 512, [&](int64_t begin, int64_t end) {
     for (int64_t n = begin; n < end; ++n) put_box(candidates.table(), n, read_box(data + 7 * rows[n]));
   });
@@ -60,6 +78,7 @@ Tensor nms_rows(const Tensor& boxes, const Tensor& scores, double iou_threshold,
   for (int64_t n = 0; n < num_kept; ++n) out_data[n] = rows[kept_candidates[n]];
   return out;
 }
+#endif
 
 Tensor nms_bev(const Tensor& boxes, const Tensor& scores, double iou_threshold, std::optional<int64_t> pre_max,
                std::optional<int64_t> post_max) {
@@ -80,4 +99,4 @@ Tensor nms_bev(const Tensor& boxes, const Tensor& scores, double iou_threshold, 
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) { m.impl("nms_bev", TORCH_BOX(&pred::nms_bev)); }
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) { PRED_IMPL(m, "nms_bev", &pred::nms_bev); }
