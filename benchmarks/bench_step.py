@@ -13,6 +13,8 @@ the rays less, again and again until it does; the name of the case tells. Conten
                `autograd.grad(create_graph=True)`; beside ours in bfloat16 also in `torch.autocast`
 ``compiled``   `torch.compile` of ``reference``, forward and backward pass in one graph
 
+On a GPU ours, eager and compiled also run with products in TF32 (`torch.set_float32_matmul_precision`).
+
 Useful arithmetic, in multiply-adds (P encoding width, h hidden, L Linear layers, C map channels, K classes): the
 trunk takes m = P h + (L - 2) h^2 per sample, the output row(s) h each; the first layer's share of the map takes
 C h per cell. A backward pass takes twice its forward pass, and the SDF's gradient is one more pass through the trunk.
@@ -51,7 +53,7 @@ from pred.models.renderer import Renderer, RendererConfig, Sharpness
 from pred.ops import DecodedField
 
 STEP = "rendering_step"
-TOLERANCES = {"float32": (1e-4, 1e-3), "bfloat16": (1e-2, 2.5e-1)}
+TOLERANCES = {"float32": (1e-4, 1e-3), "tf32": (2e-3, 5e-2), "bfloat16": (1e-2, 2.5e-1)}
 """Of the loss, and of a gradient's norm. In bfloat16 the coarse pass puts the fine samples some decimetres elsewhere,
 where the features of this map, which are noise, and the high octaves of the encoding are others."""
 ROUNDS = 3
@@ -159,23 +161,26 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "ours, bf16, recompute": {"precision": "bf16", "recompute": True},
 }
 """Options of the decoder. Each variant is a case of its own, with the same other contenders."""
+TF32 = "tf32"
+"""A variant on a GPU: torch's setting, which ours follows."""
 
 
 def contender(name: str, sizes: Sizes, device: torch.device = CPU) -> Run:
     """One step of a contender; it returns the loss, then the gradients of the map and of every parameter."""
     kind, _, options = name.partition(", ")
     step = Step(sizes, PlainField if kind == "eager" else FieldDecoder, device, **VARIANTS.get(name, {}))
-    backend = "native" if name in VARIANTS else "reference"
+    backend = "native" if kind == "ours" else "reference"
 
     def loss_and_gradients() -> list[Tensor]:
         with torch.autocast(device.type, torch.bfloat16, enabled=kind == "eager" and options == "bf16"):
             loss = step.loss()
         return [loss.detach(), *torch.autograd.grad(loss, step.leaves)]
 
-    call: Run = compiled(loss_and_gradients) if name == "compiled" else loss_and_gradients
+    call: Run = compiled(loss_and_gradients) if kind == "compiled" else loss_and_gradients
 
     def run() -> list[Tensor]:
         os.environ["PRED_BACKEND"] = backend  # read at each call
+        torch.set_float32_matmul_precision("high" if options == TF32 else "highest")
         return call()
 
     return run
@@ -240,13 +245,16 @@ def _run_step(
     rows: dict[str, Row] = {}
     runs: dict[str, Run] = {}
     expected: list[Tensor] = []
-    names = ["reference", *(VARIANTS if "ours" in kinds else ()), *(kind for kind in CONTENDERS[1:] if kind in kinds)]
+    plain = [kind for kind in CONTENDERS[1:] if kind in kinds]
+    names = ["reference", *(VARIANTS if "ours" in kinds else ()), *plain]
+    if device.type == "cuda":
+        names += [f"{kind}, {TF32}" for kind in CONTENDERS if kind in kinds]
     if {"ours", "eager"} <= set(kinds):
         names.append("eager, bf16")
     for name in names:
         on_step(f"step, {threads} threads: {name}")
         row = rows[name] = _row(name, sizes, threads, device)
-        if name in VARIANTS and (reason := missing_kernel("composite_rays", device)):
+        if row.kind == "ours" and (reason := missing_kernel("composite_rays", device)):
             row.status = f"missing: {reason}"
             continue
         try:
@@ -258,7 +266,7 @@ def _run_step(
             row.status = f"refused: {first_line(error)}"
             continue
         expected = expected or result
-        row.error, wrong = _compare(result, expected, TOLERANCES[row.flop_dtype])
+        row.error, wrong = _compare(result, expected, TOLERANCES[TF32 if name.endswith(TF32) else row.flop_dtype])
         del result
         if wrong:
             row.status = f"wrong: {wrong}"
@@ -273,17 +281,16 @@ def _run_step(
         elif name != "compiled":  # its compiler's memory would count
             on_step(f"step, {threads} threads: memory of {name}")
             _add_memory(rows[name], sizes_name)
-    found = [row for name, row in rows.items() if name in VARIANTS or row.flop_dtype == "float32"]
-    for name in VARIANTS:
-        if name != "ours" and name in rows:
-            others = (row for other, row in rows.items() if other not in VARIANTS)
-            half = rows[name].flop_dtype == "bfloat16"
-            found += [
-                replace(row, case=rows[name].case, targets=rows[name].targets)
-                for row in others
-                if row.flop_dtype == "float32" or half
-            ]
-    return found
+    found: list[Row] = []
+    for name, ours in rows.items():
+        if ours.kind == "ours":
+            variant = name.partition(", ")[2]
+            others = ["reference", *plain, *(f"{kind}, {variant}" for kind in CONTENDERS[1:])]
+            if variant.startswith("bf16"):
+                others.append("eager, bf16")
+            same = [rows[other] for other in dict.fromkeys(others) if other in rows]
+            found += [ours, *(replace(row, case=ours.case, targets=ours.targets) for row in same)]
+    return found or list(rows.values())
 
 
 def _row(name: str, sizes: Sizes, threads: int, device: torch.device) -> Row:

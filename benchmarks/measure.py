@@ -272,7 +272,7 @@ def measure_ceilings(threads: int, min_time_s: float, device: torch.device = CPU
         if missing_kernel("project_bev", device) is None:
             rows = torch.randn(1, own_rows, 1, OWN_SIZE, dtype=dtype, device=device).permute(0, 3, 1, 2)
             weight = torch.randn(OWN_SIZE, OWN_SIZE, device=device)
-            calls[f"{dtype} own"] = functools.partial(torch.ops.pred.project_bev, rows, weight)
+            calls[f"{dtype} own"] = functools.partial(torch.ops.pred.project_bev, rows, weight, False)
             flop[f"{dtype} own"] = 2 * own_rows * OWN_SIZE**2
     with torch.no_grad():
         for call in calls.values():

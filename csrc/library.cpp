@@ -45,19 +45,20 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "sample_volume_with_grad_backward(Tensor? grad_values, Tensor? grad_grads, Tensor volume, Tensor grid, "
       "bool border, bool align_corners, bool need_volume, bool need_grid, bool deterministic) -> (Tensor, Tensor)");
 
-  m.def("project_bev(Tensor bev, Tensor weight) -> Tensor");
+  // tf32: see math/product_cuda.cuh; the CPU has float32 only.
+  m.def("project_bev(Tensor bev, Tensor weight, bool tf32) -> Tensor");
   m.def(
-      "project_bev_backward(Tensor grad, Tensor bev, Tensor weight, bool need_bev, bool need_weight) -> "
+      "project_bev_backward(Tensor grad, Tensor bev, Tensor weight, bool need_bev, bool need_weight, bool tf32) -> "
       "(Tensor, Tensor)");
   m.def(
       "decode_field(Tensor projected, Tensor points, Tensor parameters, SymInt[] widths, float[] point_range, "
-      "SymInt octaves, float beta, float sdf_scale, bool with_gradient, bool keep) -> "
+      "SymInt octaves, float beta, float sdf_scale, bool with_gradient, bool keep, bool tf32) -> "
       "(Tensor sdf, Tensor semantics, Tensor gradient, Tensor activation, Tensor chain)");
   m.def(
       "decode_field_backward(Tensor? grad_sdf, Tensor? grad_semantics, Tensor? grad_gradient, Tensor projected, "
       "Tensor points, Tensor parameters, Tensor activation, Tensor chain, SymInt[] widths, "
       "float[] point_range, SymInt octaves, float beta, float sdf_scale, bool need_projected, bool need_points, "
-      "bool need_parameters, bool deterministic) -> (Tensor, Tensor, Tensor)");
+      "bool need_parameters, bool deterministic, bool tf32) -> (Tensor, Tensor, Tensor)");
 
   m.def("segment_reduce(Tensor features, Tensor index, SymInt num_segments, str reduce) -> (Tensor, Tensor)");
   m.def("segment_reduce_backward(Tensor grad, Tensor index, Tensor saved, str reduce) -> Tensor");
@@ -75,10 +76,12 @@ STABLE_TORCH_LIBRARY(pred, m) {
       "SymInt[] stride, SymInt[] padding, SymInt[] dilation, bool submanifold) -> "
       "(Tensor out_indices, Tensor out_to_in, Tensor in_to_out)");
   // weight: [O, K, C].
-  m.def("sparse_conv(Tensor features, Tensor weight, Tensor? bias, Tensor out_to_in, Tensor in_to_out) -> Tensor");
+  m.def(
+      "sparse_conv(Tensor features, Tensor weight, Tensor? bias, Tensor out_to_in, Tensor in_to_out, bool tf32) -> "
+      "Tensor");
   m.def(
       "sparse_conv_backward(Tensor grad, Tensor features, Tensor weight, Tensor out_to_in, Tensor in_to_out, "
-      "bool need_features, bool need_weight) -> (Tensor, Tensor)");
+      "bool need_features, bool need_weight, bool tf32) -> (Tensor, Tensor)");
   m.def("sparse_max_pool(Tensor features, Tensor out_to_in, Tensor in_to_out) -> (Tensor out, Tensor winner)");
   m.def("sparse_max_pool_backward(Tensor grad, Tensor winner, Tensor in_to_out) -> Tensor");
 

@@ -170,6 +170,13 @@ def deterministic() -> bool:
     return torch.are_deterministic_algorithms_enabled()
 
 
+@torch.compiler.assume_constant_result
+def tf32() -> bool:
+    """Whether products of float32 numbers may round them to TF32 on CUDA: torch's own setting for matrix products,
+    ``torch.backends.cuda.matmul.fp32_precision`` or ``torch.set_float32_matmul_precision``."""
+    return bool(torch.backends.cuda.matmul.fp32_precision == "tf32")
+
+
 def checked(op: Callable[..., Any], *arguments: Any) -> Any:
     """Calls a compiled op that checks values. Its ValueError and MemoryError pass through torch 2.13 unchanged, and
     arrive from torch 2.15 as a RuntimeError of the same text."""

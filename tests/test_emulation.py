@@ -6,11 +6,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
 
-from pred import ops
+from pred import _native, ops
+from pred.ops.decode_field import project_bev
 from tests.conftest import EMULATED, KERNEL_ERROR
 from tests.ops.examples import EXAMPLES, Example, evaluate, order_of
-from tests.tolerances import GRADIENT, assert_close
+from tests.tolerances import FORWARD, GRADIENT, assert_close, relative_error
 
 pytestmark = pytest.mark.skipif(not EMULATED, reason="the CUDA kernels are not emulated here: make emulate")
 
@@ -58,6 +60,33 @@ def test_atomics_give_the_same_gradients(native: None, op: str, dtype: torch.dty
                     assert here.shape == there.shape and torch.equal(here.isnan(), there.isnan()), name
                     # Half precision has no atomics: the same bits
                     assert_close(there.nan_to_num(), here.nan_to_num(), GRADIENT.get(dtype, 0.0), name)
+
+
+def test_tf32_where_torch_allows_it(native: None, request: pytest.FixtureRequest) -> None:
+    """One product of factors rounded to 11 bits in place of three; what is not a number stays none."""
+    generator = torch.Generator().manual_seed(0)
+    bev, weight = torch.randn(1, 40, 9, 11, generator=generator), torch.randn(24, 40, generator=generator)
+    grad = torch.randn(1, 24, 9, 11, generator=generator)
+    table = torch.arange(99, dtype=torch.int32)[:, None]
+    rows = bev[0].flatten(1).T.contiguous()
+
+    def results() -> list[Tensor]:
+        return [
+            project_bev(bev, weight),
+            *torch.ops.pred.project_bev_backward(grad, bev, weight, True, True, _native.tf32()),
+            ops.sparse_conv(rows, weight[:, None], table, table),
+        ]
+
+    precise = results()
+    request.addfinalizer(lambda: torch.set_float32_matmul_precision("highest"))
+    torch.set_float32_matmul_precision("high")
+    for here, there in zip(precise, results(), strict=True):
+        error = relative_error(there, here)
+        assert 1e-5 < error < 1e-3
+    exact = torch.einsum("oc,bchw->bohw", weight.double(), bev.double())
+    assert relative_error(precise[0], exact) < FORWARD[torch.float32]
+    bev[0, 3, 2, 5] = torch.nan
+    assert project_bev(bev, weight)[0, :, 2, 5].isnan().all()
 
 
 def test_unknown_order_is_refused(native: None, monkeypatch: pytest.MonkeyPatch) -> None:

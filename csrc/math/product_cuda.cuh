@@ -2,8 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Matrix products with epilogues on the accumulators, on tensor cores: bfloat16, and float32 as three products of its
-// parts in TF32, which together have the accuracy of float32. float64, and what a device has no tensor cores for, is
-// multiplied and added one by one.
+// parts in TF32, which together have the accuracy of float32; or as one product of rounded factors, where TF32 is
+// asked for. float64, and what a device has no tensor cores for, is multiplied and added one by one.
 //
 // A block owns a tile of kTileM x kTileN results, its warps pieces of it. Both factors go through shared memory in
 // stages; the next ones are fetched while one is multiplied. Sums over k are made in one order.
@@ -170,12 +170,13 @@ PRED_DEVICE_ONLY void load_right(const SharedTile<S, kOuter>& tile, int column, 
   }
 }
 
-// Numbers of 24 bits as sums of two, of which the instructions read 11 bits each. NaN and infinity give NaN.
+// Numbers of 24 bits as sums of two, of which the instructions read 11 bits each. The rest of infinity is NaN.
 PRED_DEVICE_ONLY void split_tf32(uint32_t (&x)[4], uint32_t (&rest)[4]) {
 #pragma unroll
   for (int i = 0; i < 4; ++i) {
-    const uint32_t nearest = (x[i] + 0x1000u) & 0xffffe000u;
-    rest[i] = bits_as<uint32_t>(bits_as<float>(x[i]) - bits_as<float>(nearest));
+    const float value = bits_as<float>(x[i]);
+    const uint32_t nearest = value == value ? (x[i] + 0x1000u) & 0xffffe000u : x[i];
+    rest[i] = bits_as<uint32_t>(value - bits_as<float>(nearest));
     x[i] = nearest;
   }
 }
@@ -183,7 +184,7 @@ PRED_DEVICE_ONLY void split_tf32(uint32_t (&x)[4], uint32_t (&rest)[4]) {
 // One stage: sum += rows [row0, row0 + kWarpM) of `left` times rows [column0, column0 + kWarpN) of `right`.
 template <typename S, bool kOuter, typename T = Compute<S>>
 PRED_DEVICE_ONLY void multiply_stage(const SharedTile<S, kOuter>& left, const SharedTile<S, kOuter>& right, int row0,
-                                     int column0, T (&sum)[kPiecesM][kPiecesN][4]) {
+                                     int column0, bool tf32, T (&sum)[kPiecesM][kPiecesN][4]) {
   static_assert(std::is_same_v<S, BFloat16> || std::is_same_v<S, float> || std::is_same_v<S, double>);
   if constexpr (kTensorCores && !std::is_same_v<S, double>) {
 #pragma unroll
@@ -203,8 +204,10 @@ PRED_DEVICE_ONLY void multiply_stage(const SharedTile<S, kOuter>& left, const Sh
         for (int j = 0; j < kPiecesN; ++j) {
           const int at = j % 2 * 2;
           if constexpr (std::is_same_v<S, float>) {
-            mma_tf32(sum[i][j], a_rest, b[j / 2][at], b[j / 2][at + 1]);
-            mma_tf32(sum[i][j], a, b_rest[j / 2][at], b_rest[j / 2][at + 1]);
+            if (!tf32) {
+              mma_tf32(sum[i][j], a_rest, b[j / 2][at], b[j / 2][at + 1]);
+              mma_tf32(sum[i][j], a, b_rest[j / 2][at], b_rest[j / 2][at + 1]);
+            }
             mma_tf32(sum[i][j], a, b[j / 2][at], b[j / 2][at + 1]);
           } else {
             mma_bfloat16(sum[i][j], a, b[j / 2][at], b[j / 2][at + 1]);
@@ -272,6 +275,7 @@ PRED_DEVICE_ONLY void wait_for_copies() {
 struct ProductSizes {
   int64_t m, n, k;
   int segments, splits;
+  bool tf32;
 };
 
 constexpr int kMostSparseSegments = 512;
@@ -350,7 +354,7 @@ __global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1
       __syncthreads();  // this stage is there, and the one before has been read
       if (step + kStages - 1 < steps) fetch();
       commit_copies();
-      multiply_stage<S, kOuter>(tiles[stage][0], tiles[stage][1], row0, column0, sum);
+      multiply_stage<S, kOuter>(tiles[stage][0], tiles[stage][1], row0, column0, sizes.tf32, sum);
       stage = stage + 1 < kStages ? stage + 1 : 0;
     }
     const int64_t row = first_m + row0 + lane_number() / 4, column = first_n + column0 + lane_number() % 4 * 2;

@@ -37,7 +37,7 @@ struct Field {
 
   Field(const char* name, const Tensor& map_in, const Tensor& points_in, const Tensor& parameters_in,
         const std::vector<int64_t>& widths_in, const std::vector<double>& point_range, int64_t octaves, double beta,
-        double sdf_scale)
+        double sdf_scale, bool tf32)
       : op(name), widths(widths_in) {
     constexpr ScalarType dtype = std::is_same_v<T, double> ? ScalarType::Double : ScalarType::Float;
     check_tensor(op, "projected", map_in, 4, map_in.scalar_type());
@@ -71,6 +71,7 @@ struct Field {
     args.octaves = octaves;
     args.beta = positive("beta", beta);
     args.sdf_scale = positive("sdf_scale", sdf_scale);
+    args.tf32 = tf32;
     args.num_hidden = layers - 1;
     args.num_outputs = widths[layers];
     if constexpr (!kLaunch) pack_parameters();
@@ -221,9 +222,10 @@ void forward(const Field<S>& in, const FieldSaved<S>& saved, const FieldOutputs<
 
 Outputs decode_field(const Tensor& projected, const Tensor& points, const Tensor& parameters,
                      std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
-                     double sdf_scale, bool with_gradient, bool keep) {
+                     double sdf_scale, bool with_gradient, bool keep, bool tf32) {
   return PRED_DISPATCH_FACTOR("decode_field", projected.scalar_type(), [&] {
-    const Field<S> in("decode_field", projected, points, parameters, widths, point_range, octaves, beta, sdf_scale);
+    const Field<S> in("decode_field", projected, points, parameters, widths, point_range, octaves, beta, sdf_scale,
+                      tf32);
     const int64_t frames = in.batch, count = points.size(1), classes = in.args.num_outputs - 1;
     Tensor sdf = torch::stable::new_empty(in.points, {frames, count});
     Tensor semantics = torch::stable::new_empty(in.points, {frames, count, classes});
@@ -298,10 +300,10 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
     std::optional<Tensor> grad_sdf, std::optional<Tensor> grad_semantics, std::optional<Tensor> grad_gradient,
     const Tensor& projected, const Tensor& points, const Tensor& parameters, const Tensor& activation,
     const Tensor& chain, std::vector<int64_t> widths, std::vector<double> point_range, int64_t octaves, double beta,
-    double sdf_scale, bool need_projected, bool need_points, bool need_parameters, bool deterministic) {
+    double sdf_scale, bool need_projected, bool need_points, bool need_parameters, bool deterministic, bool tf32) {
   const char* op = "decode_field_backward";
   return PRED_DISPATCH_FACTOR(op, projected.scalar_type(), [&] {
-    Field<S> in(op, projected, points, parameters, widths, point_range, octaves, beta, sdf_scale);
+    Field<S> in(op, projected, points, parameters, widths, point_range, octaves, beta, sdf_scale, tf32);
     const int64_t frames = in.batch, count = points.size(1), classes = in.args.num_outputs - 1;
     std::vector<Tensor> kept;
     const auto cotangent = [&](const char* name, const std::optional<Tensor>& tensor,

@@ -47,6 +47,7 @@ struct FieldArgs {
   T centre[3], half_extent[3];
   int64_t octaves;
   T beta, sdf_scale;
+  bool tf32;                        // where kernels are launched
   int64_t num_hidden, num_outputs;  // outputs: 1, or 1 + K
   // Not where kernels are launched, which take the parameters as they are. Packed: up[l] is W_l^T, [inputs, width];
   // down[l] is W_l, [width, inputs]. Index num_hidden is the output layer.

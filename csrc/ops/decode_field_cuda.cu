@@ -368,9 +368,9 @@ void encode(const FieldArgs<S>& a, const Space<S>& space, int64_t first, int64_t
 
 // Rows times W_l, or its transpose; all of them with rows of hidden width as results but where n says otherwise.
 template <typename S, class Epilogue>
-void multiply(const S* rows, int64_t row_stride, int64_t count, const S* weight, int64_t k, int64_t outputs, int64_t n,
-              const Epilogue& epilogue) {
-  launch_product<S, false>({count, n, k, 1, 1}, ProductRows<S>{rows, row_stride, count},
+void multiply(const FieldArgs<S>& a, const S* rows, int64_t row_stride, int64_t count, const S* weight, int64_t k,
+              int64_t outputs, int64_t n, const Epilogue& epilogue) {
+  launch_product<S, false>({count, n, k, 1, 1, a.tf32}, ProductRows<S>{rows, row_stride, count},
                            ProductRows<S>{weight, k, outputs}, epilogue);
 }
 
@@ -381,11 +381,11 @@ void activations(const FieldArgs<S>& a, const Space<S>& space, const Parameters<
     const Activate<S> epilogue{beta,        parameters.bias[l], l == 0 ? space.gathered : nullptr,
                                space.width, space.stride,       space.activation[l]};
     if (l == 0) {
-      multiply<S>(space.encoding, space.encoding_stride, rows, space.first, space.encoding_stride, space.width,
-                  space.columns, epilogue);
+      multiply(a, space.encoding, space.encoding_stride, rows, space.first, space.encoding_stride, space.width,
+               space.columns, epilogue);
     } else {
-      multiply<S>(space.activation[l - 1], space.stride, rows, space.up[l], space.columns, space.width, space.columns,
-                  epilogue);
+      multiply(a, space.activation[l - 1], space.stride, rows, space.up[l], space.columns, space.width, space.columns,
+               epilogue);
     }
   }
 }
@@ -409,8 +409,8 @@ void chain(const FieldArgs<S>& a, const Space<S>& space, const Parameters<T>& pa
                  static_cast<const S*>(space.activation[last]), space.width, space.columns, space.stride, rows,
                  space.chain[last]);
   for (int64_t l = last; l > 0 && !known; --l) {
-    multiply<S>(space.chain[l], space.stride, rows, space.down[l], space.columns, space.width, space.columns,
-                Chain<S>{beta, space.activation[l - 1], space.width, space.stride, space.chain[l - 1]});
+    multiply(a, space.chain[l], space.stride, rows, space.down[l], space.columns, space.width, space.columns,
+             Chain<S>{beta, space.activation[l - 1], space.width, space.stride, space.chain[l - 1]});
   }
 }
 
@@ -488,9 +488,9 @@ __global__ void __launch_bounds__(kThreads)
 
 // few = rows W_1
 template <typename S, typename T = Compute<S>>
-void encoding_columns(const Space<S>& space, const S* rows, int64_t count, T* few) {
-  multiply<S>(rows, space.stride, count, space.down[0], space.columns, space.encoding_width, space.encoding_width,
-              StoreFew<T>{few, space.encoding_width});
+void encoding_columns(const FieldArgs<S>& a, const Space<S>& space, const S* rows, int64_t count, T* few) {
+  multiply(a, rows, space.stride, count, space.down[0], space.columns, space.encoding_width, space.encoding_width,
+           StoreFew<T>{few, space.encoding_width});
 }
 
 template <typename S, typename T = Compute<S>>
@@ -507,12 +507,12 @@ void forward(const FieldArgs<S>& a, const T* parameter_data, const FieldSaved<S>
     gather<false>(a, space, first, rows);
     activations(a, space, parameters, rows);
     const int64_t last = space.layers;
-    multiply<S>(
-        space.activation[last - 1], space.stride, rows, space.up[last], space.columns, a.num_outputs, a.num_outputs,
+    multiply(
+        a, space.activation[last - 1], space.stride, rows, space.up[last], space.columns, a.num_outputs, a.num_outputs,
         StoreOutputs<T>{parameters.bias[last], a.sdf_scale, out.sdf + first, out.semantics + first * classes, classes});
     if (!out.gradient) continue;
     chain(a, space, parameters, rows, false);
-    encoding_columns(space, space.chain[0], rows, space.few);
+    encoding_columns(a, space, space.chain[0], rows, space.few);
     launch_warps(position_gradient_kernel<false, S>, rows, a.map, range_of(a, first), space,
                  static_cast<const S*>(space.chain[0]), static_cast<const S*>(nullptr), first, rows,
                  out.gradient + 3 * first);
@@ -550,11 +550,11 @@ void tangents(const FieldArgs<S>& a, const Space<S>& space, int64_t first, int64
         beta,        a.beta,       space.activation[l], space.chain[l], l == 0 ? space.gathered : nullptr,
         space.width, space.stride, space.rate[l],       space.back[l]};
     if (l == 0) {
-      multiply<S>(space.encoding_rate, space.rate_stride, rows, space.up[0], space.rate_stride, space.width,
-                  space.columns, epilogue);
+      multiply(a, space.encoding_rate, space.rate_stride, rows, space.up[0], space.rate_stride, space.width,
+               space.columns, epilogue);
     } else {
-      multiply<S>(space.rate[l - 1], space.stride, rows, space.up[l], space.columns, space.width, space.columns,
-                  epilogue);
+      multiply(a, space.rate[l - 1], space.stride, rows, space.up[l], space.columns, space.width, space.columns,
+               epilogue);
     }
   }
 }
@@ -567,11 +567,11 @@ void reverse(const FieldArgs<S>& a, const Space<S>& space, int64_t rows, bool ha
     const Reverse<S> epilogue{beta,         space.activation[l - 1], has_tangents, space.width,
                               space.stride, space.back[l - 1]};
     if (l == space.layers) {
-      multiply<S>(space.output, space.output_stride, rows, space.down[l], space.output_stride, space.width,
-                  space.columns, epilogue);
+      multiply(a, space.output, space.output_stride, rows, space.down[l], space.output_stride, space.width,
+               space.columns, epilogue);
     } else {
-      multiply<S>(space.back[l], space.stride, rows, space.down[l], space.columns, space.width, space.columns,
-                  epilogue);
+      multiply(a, space.back[l], space.stride, rows, space.down[l], space.columns, space.width, space.columns,
+               epilogue);
     }
   }
 }
@@ -616,7 +616,7 @@ void add_parameters(const FieldArgs<S>& a, const Space<S>& space, int64_t rows, 
     const TwoRows<S> rights{
         {l == 0 ? rows_of(space.encoding, space.encoding_stride) : rows_of(space.activation[l - 1], space.stride),
          l == 0 ? rows_of(space.encoding_rate, space.rate_stride) : rows_of(space.rate[l - 1], space.stride)}};
-    launch_product<S, true>({out, in, rows, two ? 2 : 1, space.splits[l]}, lefts, rights,
+    launch_product<S, true>({out, in, rows, two ? 2 : 1, space.splits[l], a.tf32}, lefts, rights,
                             AddToParts<T>{space.parts[l], out, in, set});
     add_columns(left, left_stride, out, rows, set, space.bias_parts[l]);
   }
@@ -678,8 +678,8 @@ void backward(const FieldArgs<S>& a, const T* parameter_data, const FieldSaved<S
     reverse(a, space, rows, has_tangents);
     if (out.parameters) add_parameters(a, space, rows, has_tangents, first == 0);
     if (out.points) {
-      encoding_columns(space, space.back[0], rows, space.few);
-      if (has_tangents) encoding_columns(space, space.chain[0], rows, space.few_chain);
+      encoding_columns(a, space, space.back[0], rows, space.few);
+      if (has_tangents) encoding_columns(a, space, space.chain[0], rows, space.few_chain);
       launch_warps(has_tangents ? position_gradient_kernel<true, S> : position_gradient_kernel<false, S>, rows, a.map,
                    range_of(a, first), space, static_cast<const S*>(space.back[0]),
                    static_cast<const S*>(space.chain[0]), first, rows, out.points + 3 * first);

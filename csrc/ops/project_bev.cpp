@@ -28,7 +28,7 @@ struct Projection {
   std::unique_ptr<char[]> packed;
   ProjectArgs<S> args{};
 
-  Projection(const char* op, const Tensor& bev_in, const Tensor& weight_in, bool backward) {
+  Projection(const char* op, const Tensor& bev_in, const Tensor& weight_in, bool backward, bool tf32) {
     check_tensor(op, "bev", bev_in, 4, bev_in.scalar_type());
     check_tensor(op, "weight", weight_in, 2, std::is_same_v<T, double> ? ScalarType::Double : ScalarType::Float);
     PRED_CHECK(weight_in.size(1) == bev_in.size(1) && weight_in.size(0) >= 1 && weight_in.size(1) >= 1, op,
@@ -38,6 +38,7 @@ struct Projection {
     args.inputs = weight.size(1);
     args.outputs = weight.size(0);
     args.rows = storage<S>(bev);
+    args.tf32 = tf32;
     cells = bev.numel() / args.inputs;
     if constexpr (!kLaunch) pack_weight(backward);
   }
@@ -112,16 +113,17 @@ void backward(const Projection<S>& in, S* grad_rows, T* grad_weight) {
   }
 }
 
-Tensor project_bev(const Tensor& bev, const Tensor& weight) {
+Tensor project_bev(const Tensor& bev, const Tensor& weight, bool tf32) {
   const char* op = "project_bev";
-  return PRED_DISPATCH_FACTOR(op, bev.scalar_type(), [&] { return forward(Projection<S>(op, bev, weight, false)); });
+  return PRED_DISPATCH_FACTOR(op, bev.scalar_type(),
+                              [&] { return forward(Projection<S>(op, bev, weight, false, tf32)); });
 }
 
 std::tuple<Tensor, Tensor> project_bev_backward(const Tensor& grad_in, const Tensor& bev, const Tensor& weight,
-                                                bool need_bev, bool need_weight) {
+                                                bool need_bev, bool need_weight, bool tf32) {
   const char* op = "project_bev_backward";
   return PRED_DISPATCH_FACTOR(op, bev.scalar_type(), [&] {
-    Projection<S> in(op, bev, weight, true);
+    Projection<S> in(op, bev, weight, true, tf32);
     check_tensor(op, "grad", grad_in, 4, bev.scalar_type());
     check_sizes(op, "grad", grad_in, {bev.size(0), weight.size(0), bev.size(2), bev.size(3)});
     const Tensor grad = torch::stable::contiguous(grad_in, MemoryFormat::ChannelsLast);

@@ -17,6 +17,7 @@ struct ProjectArgs {
   const S* rows;            // [cells, C]
   const S* grad;            // [cells, h], of the backward pass
   const S* packed;          // W^T forward, W backward; not where kernels are launched
+  bool tf32;                // where kernels are launched
 };
 
 // Gradients; null where not wanted. The weight's, [h, columns(C)], is added to; launched, [h, C] is written.

@@ -24,9 +24,11 @@ PRED_KERNELS_BY_STORAGE(SparseConvKernels, sparse_conv)
 struct Problem {
   Tensor features, weight, out_to_in, in_to_out;  // [M, C], [O, K, C], [M', K], [M, K]
   int64_t rows_in, rows_out, inputs, outputs, taps;
+  bool tf32;
 
   Problem(const char* op, const Tensor& features_in, const Tensor& weight_in, const Tensor& out_to_in_in,
-          const Tensor& in_to_out_in) {
+          const Tensor& in_to_out_in, bool tf32_in)
+      : tf32(tf32_in) {
     check_tensor(op, "features", features_in, 2, features_in.scalar_type());
     check_tensor(op, "weight", weight_in, 3, features_in.scalar_type());
     inputs = features_in.size(1), outputs = weight_in.size(0), taps = weight_in.size(1);
@@ -51,7 +53,7 @@ Tensor workspace_for(const Problem& in, const SparseConvArgs<S>& a, bool of_weig
 template <typename S>
 void product(const Problem& in, const Tensor& table, const S* source, bool transposed, const S* bias, S* out) {
   SparseConvArgs<S> a{
-      table.const_data_ptr<int32_t>(), in.taps, in.inputs, in.outputs, source, nullptr, 0, bias, nullptr};
+      table.const_data_ptr<int32_t>(), in.taps, in.inputs, in.outputs, source, nullptr, 0, bias, nullptr, in.tf32};
   if (transposed) std::swap(a.inputs, a.outputs);
   const int64_t rows = transposed ? in.rows_in : in.rows_out, source_rows = transposed ? in.rows_out : in.rows_in;
   const Tensor workspace = workspace_for(in, a, false, rows, source_rows);
@@ -69,7 +71,8 @@ void weight_gradient(const Problem& in, const S* grad, S* out) {
                             nullptr,
                             0,
                             nullptr,
-                            grad};
+                            grad,
+                            in.tf32};
   const Tensor workspace = workspace_for(in, a, true, in.rows_out, in.rows_in);
   sparse_conv_kernels<S>().weight(a, out, mutable_storage<char>(workspace), in.rows_out, in.rows_in);
 }
@@ -80,7 +83,7 @@ void product(const Problem& in, const Tensor& table, const S* source, bool trans
   using T = Compute<S>;
   const SparseConvKernels<S>& k = sparse_conv_kernels<S>();
   SparseConvArgs<S> a{
-      table.const_data_ptr<int32_t>(), in.taps, in.inputs, in.outputs, source, nullptr, 0, bias, nullptr};
+      table.const_data_ptr<int32_t>(), in.taps, in.inputs, in.outputs, source, nullptr, 0, bias, nullptr, in.tf32};
   if (transposed) std::swap(a.inputs, a.outputs);
   a.packed_size = k.packed_size(a.inputs, a.outputs);
   const auto packed = allocate_array<char>(in.taps * a.packed_size * int64_t(sizeof(Factor<S>)) + Arena::kAlignment);
@@ -115,7 +118,8 @@ void weight_gradient(const Problem& in, const S* grad, S* out) {
                       nullptr,
                       0,
                       nullptr,
-                      grad};
+                      grad,
+                      in.tf32};
   const bool transposed = in.rows_in < in.rows_out;
   if (transposed) {
     a.table = in.in_to_out.const_data_ptr<int32_t>();
@@ -149,10 +153,10 @@ void weight_gradient(const Problem& in, const S* grad, S* out) {
 #endif
 
 Tensor sparse_conv(const Tensor& features, const Tensor& weight, const std::optional<Tensor>& bias_in,
-                   const Tensor& out_to_in, const Tensor& in_to_out) {
+                   const Tensor& out_to_in, const Tensor& in_to_out, bool tf32) {
   const char* op = "sparse_conv";
   return PRED_DISPATCH_STORAGE(op, features.scalar_type(), [&] {
-    const Problem in(op, features, weight, out_to_in, in_to_out);
+    const Problem in(op, features, weight, out_to_in, in_to_out, tf32);
     Tensor bias;
     if (bias_in) {
       check_tensor(op, "bias", *bias_in, 1, features.scalar_type());
@@ -169,10 +173,10 @@ Tensor sparse_conv(const Tensor& features, const Tensor& weight, const std::opti
 
 std::tuple<Tensor, Tensor> sparse_conv_backward(const Tensor& grad_in, const Tensor& features, const Tensor& weight,
                                                 const Tensor& out_to_in, const Tensor& in_to_out, bool need_features,
-                                                bool need_weight) {
+                                                bool need_weight, bool tf32) {
   const char* op = "sparse_conv_backward";
   return PRED_DISPATCH_STORAGE(op, features.scalar_type(), [&] {
-    const Problem in(op, features, weight, out_to_in, in_to_out);
+    const Problem in(op, features, weight, out_to_in, in_to_out, tf32);
     check_tensor(op, "grad", grad_in, 2, features.scalar_type());
     check_sizes(op, "grad", grad_in, {in.rows_out, in.outputs});
     const Tensor grad = torch::stable::contiguous(grad_in);

@@ -32,6 +32,7 @@ struct SparseConvArgs {
   int64_t packed_size;      // of each
   const S* bias;            // [outputs] or null; of the product alone
   const S* grad;            // [rows, outputs]; of the weight's gradient alone
+  bool tf32;                // where kernels are launched
 };
 
 #ifdef PRED_LAUNCH

@@ -126,7 +126,7 @@ void product(const SparseConvArgs<S>& a, const S* weight, bool transposed, S* ou
   launch_threads(pack_taps_kernel<S, F>, a.taps * a.outputs * stride, weight, a.taps, a.inputs, a.outputs, stride,
                  transposed, space.weight);
   const ProductRows<F> source = factor_rows(a.source, a.inputs, source_rows, space.source);
-  launch_product<F, false>({rows, a.outputs, stride, int(a.taps), 1}, table_rows(a, source, rows, 0),
+  launch_product<F, false>({rows, a.outputs, stride, int(a.taps), 1, a.tf32}, table_rows(a, source, rows, 0),
                            TapRows<F>{space.weight, stride, a.outputs}, StoreWithBias<S>{a.bias, out, a.outputs});
 }
 
@@ -138,8 +138,8 @@ void weight(const SparseConvArgs<S>& a, S* grad_weight, char* workspace, int64_t
   const ProductRows<F> source = factor_rows(a.source, a.inputs, source_rows, space.source);
   const ProductRows<F> grad = factor_rows(a.grad, a.outputs, rows, space.grad);
   for (int64_t tap = 0; tap < a.taps; ++tap) {
-    launch_product<F, true>({a.outputs, a.inputs, rows, 1, space.splits}, grad, table_rows(a, source, rows, tap),
-                            AddToParts<T>{space.parts, a.outputs, a.inputs, true});
+    launch_product<F, true>({a.outputs, a.inputs, rows, 1, space.splits, a.tf32}, grad,
+                            table_rows(a, source, rows, tap), AddToParts<T>{space.parts, a.outputs, a.inputs, true});
     launch_threads(write_weight_kernel<S>, a.outputs * a.inputs, static_cast<const T*>(space.parts), space.splits,
                    a.taps, tap, a.outputs, a.inputs, grad_weight);
   }

@@ -101,7 +101,7 @@ def project_bev(
     if not _native.use_native(op, bev):
         return _project_reference(bev.to(weight.dtype), columns)
     with torch.autocast(bev.device.type, enabled=False):  # which would widen the map
-        projected: Tensor = torch.ops.pred.project_bev(bev.to(_storage(precision, weight)), columns)
+        projected: Tensor = torch.ops.pred.project_bev(bev.to(_storage(precision, weight)), columns, _native.tf32())
     return projected
 
 
@@ -182,7 +182,7 @@ def _compiled(
     widths = [first.shape[1] - channels, *(weight.shape[0] for weight in weights)]
     learns = torch.is_grad_enabled() and (projected.requires_grad or points.requires_grad or parameters.requires_grad)
     sdf, semantics, gradient, *_ = torch.ops.pred.decode_field(
-        projected, points, parameters, widths, *settings, with_gradient, learns and not recompute
+        projected, points, parameters, widths, *settings, with_gradient, learns and not recompute, _native.tf32()
     )
     return DecodedField(sdf, semantics if widths[-1] > 1 else None, gradient if with_gradient else None)
 
@@ -389,23 +389,23 @@ def _channels_last(like: Tensor, channels: int) -> Tensor:
     return like.new_empty(frames, height, width, channels).permute(0, 3, 1, 2)
 
 
-def _project_fake(bev: Tensor, weight: Tensor) -> Tensor:
+def _project_fake(bev: Tensor, weight: Tensor, tf32: bool) -> Tensor:
     return _channels_last(bev, weight.shape[0])
 
 
 def _project_save(ctx: Any, inputs: Any, output: Any) -> None:
-    ctx.save_for_backward(*inputs)
+    ctx.save_for_backward(*inputs[:2])
 
 
 def _project_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     need = ctx.needs_input_grad
     with torch.autocast(grad.device.type, enabled=False):
-        found = torch.ops.pred.project_bev_backward(grad, *ctx.saved_tensors, need[0], need[1])
-    return tuple(value if wanted else None for value, wanted in zip(found, need, strict=True))
+        found = torch.ops.pred.project_bev_backward(grad, *ctx.saved_tensors, need[0], need[1], _native.tf32())
+    return (*(value if wanted else None for value, wanted in zip(found, need[:2], strict=True)), None)
 
 
 def _project_backward_fake(
-    grad: Tensor, bev: Tensor, weight: Tensor, need_bev: bool, need_weight: bool
+    grad: Tensor, bev: Tensor, weight: Tensor, need_bev: bool, need_weight: bool, tf32: bool
 ) -> tuple[Tensor, Tensor]:
     return (
         _channels_last(bev, bev.shape[1]) if need_bev else bev.new_empty(0),
@@ -424,6 +424,7 @@ def _fake(
     sdf_scale: float,
     with_gradient: bool,
     keep: bool,
+    tf32: bool,
 ) -> tuple[Tensor, ...]:
     frames, count = points.shape[:2]
     hidden = len(widths) - 2
@@ -442,7 +443,7 @@ def _fake(
 
 
 def _save(ctx: Any, inputs: Any, output: Any) -> None:
-    projected, points, parameters, *settings, ctx.with_gradient, _ = inputs
+    projected, points, parameters, *settings, ctx.with_gradient, _, _ = inputs
     ctx.settings = settings
     ctx.save_for_backward(projected, points, parameters, *output[3:])
     ctx.mark_non_differentiable(*output[3:])
@@ -451,7 +452,7 @@ def _save(ctx: Any, inputs: Any, output: Any) -> None:
 
 def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
     sdf, semantics, gradient, *_ = grads
-    none = (None,) * 7
+    none = (None,) * 8
     if sdf is None and semantics is None and gradient is None:
         return (None, None, None, *none)
     need = ctx.needs_input_grad
@@ -459,7 +460,7 @@ def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
     with torch.autocast(points.device.type, enabled=False):  # which would widen the map and what was kept
         found = torch.ops.pred.decode_field_backward(
             sdf, semantics, gradient if ctx.with_gradient else None, projected, points, parameters, *kept,
-            *ctx.settings, need[0], need[1], need[2], _native.deterministic(),
+            *ctx.settings, need[0], need[1], need[2], _native.deterministic(), _native.tf32(),
         )  # fmt: skip
     return (*(value if wanted else None for value, wanted in zip(found, need, strict=False)), *none)
 
@@ -482,6 +483,7 @@ def _backward_fake(
     need_points: bool,
     need_parameters: bool,
     deterministic: bool,
+    tf32: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     frames, count = points.shape[:2]
     return (

@@ -50,7 +50,9 @@ def sparse_conv(
     features, weight, bias = _arguments(features, weight, out_to_in, in_to_out, bias)
     if not _native.use_native(op, features):
         return _reference(features, weight, out_to_in, bias)
-    out: Tensor = _native.checked(torch.ops.pred.sparse_conv, features, weight, bias, out_to_in, in_to_out)
+    out: Tensor = _native.checked(
+        torch.ops.pred.sparse_conv, features, weight, bias, out_to_in, in_to_out, _native.tf32()
+    )
     return out
 
 
@@ -100,12 +102,14 @@ def _arguments(
     return features, weight, bias
 
 
-def _fake(features: Tensor, weight: Tensor, bias: Tensor | None, out_to_in: Tensor, in_to_out: Tensor) -> Tensor:
+def _fake(
+    features: Tensor, weight: Tensor, bias: Tensor | None, out_to_in: Tensor, in_to_out: Tensor, tf32: bool
+) -> Tensor:
     return features.new_empty(out_to_in.shape[0], weight.shape[0])
 
 
 def _save(ctx: Any, inputs: Any, output: Any) -> None:
-    features, weight, bias, out_to_in, in_to_out = inputs
+    features, weight, bias, out_to_in, in_to_out, _ = inputs
     ctx.save_for_backward(features, weight, out_to_in, in_to_out)
 
 
@@ -115,11 +119,11 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     grad_features = grad_weight = grad_bias = None
     if need_features or need_weight:
         grad_features, grad_weight = torch.ops.pred.sparse_conv_backward(
-            grad, features, weight, out_to_in, in_to_out, need_features, need_weight
+            grad, features, weight, out_to_in, in_to_out, need_features, need_weight, _native.tf32()
         )
     if need_bias:
         grad_bias = _sum_of_rows(grad)
-    return grad_features if need_features else None, grad_weight if need_weight else None, grad_bias, None, None
+    return (grad_features if need_features else None, grad_weight if need_weight else None, grad_bias, *(None,) * 3)
 
 
 def _sum_of_rows(rows: Tensor) -> Tensor:
@@ -140,6 +144,7 @@ def _fake_backward(
     in_to_out: Tensor,
     need_features: bool,
     need_weight: bool,
+    tf32: bool,
 ) -> tuple[Tensor, Tensor]:
     outputs, taps, inputs = weight.shape
     return (
@@ -149,7 +154,7 @@ def _fake_backward(
 
 
 def _save_backward(ctx: Any, inputs: Any, output: Any) -> None:
-    grad, features, weight, out_to_in, in_to_out, ctx.need_features, ctx.need_weight = inputs
+    grad, features, weight, out_to_in, in_to_out, ctx.need_features, ctx.need_weight, _ = inputs
     ctx.save_for_backward(grad, features, weight, out_to_in, in_to_out)
 
 
@@ -160,19 +165,19 @@ def _double_backward(ctx: Any, grad_features: Tensor | None, grad_weight: Tensor
     need_grad, need_features, need_weight = ctx.needs_input_grad[:3]
     found: list[Tensor | None] = [None, None, None]
     conv, backward = torch.ops.pred.sparse_conv, torch.ops.pred.sparse_conv_backward
-    tables = (out_to_in, in_to_out)
+    tables, tf32 = (out_to_in, in_to_out), _native.tf32()
     if ctx.need_features and grad_features is not None:
         if need_grad:
-            found[0] = conv(grad_features, weight, None, *tables)
+            found[0] = conv(grad_features, weight, None, *tables, tf32)
         if need_weight:
-            found[2] = backward(grad, grad_features, weight, *tables, False, True)[1]
+            found[2] = backward(grad, grad_features, weight, *tables, False, True, tf32)[1]
     if ctx.need_weight and grad_weight is not None:
         if need_grad:
-            more = conv(features, grad_weight, None, *tables)
+            more = conv(features, grad_weight, None, *tables, tf32)
             found[0] = more if found[0] is None else found[0] + more
         if need_features:
-            found[1] = backward(grad, features, grad_weight, *tables, True, False)[0]
-    return *found, None, None, None, None
+            found[1] = backward(grad, features, grad_weight, *tables, True, False, tf32)[0]
+    return (*found, *(None,) * 5)
 
 
 _native.register("sparse_conv", fake=_fake, setup_context=_save, backward=_backward)

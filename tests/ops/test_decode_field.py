@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -431,7 +432,7 @@ def test_errors(backend: str) -> None:
 def test_direct_calls_are_checked(native: None) -> None:
     bev, points, parameters = torch.zeros(1, 16, 2, 2), torch.zeros(1, 5, 3), torch.zeros(16 * 4 + 17)
     settings: tuple[Any, ...] = ([3, 16, 1], list(RANGE), 0, 10.0, 1.0)
-    call = torch.ops.pred.decode_field
+    call = functools.partial(torch.ops.pred.decode_field, tf32=False)
     call(bev, points, parameters, *settings, True, True)
     with pytest.raises(KERNEL_ERROR, match="decode_field: parameters must have 81 elements, got 80"):
         call(bev, points, parameters[1:], *settings, True, True)
@@ -459,5 +460,5 @@ def test_direct_calls_are_checked(native: None) -> None:
     with pytest.raises(KERNEL_ERROR, match=r"decode_field_backward: grad_sdf must have shape \[1, 5\], got \[1, 4\]"):
         torch.ops.pred.decode_field_backward(
             points[:, 1:, 0], None, None, bev, points, parameters, *[torch.zeros(0, 0, 0)] * 2, *settings,
-            True, True, True, True,
+            True, True, True, True, False,
         )  # fmt: skip

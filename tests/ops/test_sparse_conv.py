@@ -386,11 +386,11 @@ def test_direct_calls_are_checked(native: None) -> None:
     with pytest.raises(KERNEL_ERROR, match=r"spatial_shape must give at most 2\^62 sites .* got \[1073741824, "):
         call.build_rulebook(line, 1, [2**30] * 3, *sizes[1:], True)
     with pytest.raises(KERNEL_ERROR, match=r"sparse_conv: weight must have shape \[O, K, 4\], got \[3, 3, 5\]"):
-        call.sparse_conv(features, torch.zeros(3, 3, 5), None, table, table)
+        call.sparse_conv(features, torch.zeros(3, 3, 5), None, table, table, False)
     with pytest.raises(KERNEL_ERROR, match=r"sparse_conv: bias must have shape \[3\], got \[4\]"):
-        call.sparse_conv(features, weight, torch.zeros(4), table, table)
+        call.sparse_conv(features, weight, torch.zeros(4), table, table, False)
     with pytest.raises(KERNEL_ERROR, match=r"sparse_conv_backward: grad must have shape \[2, 3\], got \[2, 4\]"):
-        call.sparse_conv_backward(features, features, weight, table, table, True, True)
+        call.sparse_conv_backward(features, features, weight, table, table, True, True, False)
     with pytest.raises(KERNEL_ERROR, match="sparse_max_pool: in_to_out must have dtype Int, got Long"):
         call.sparse_max_pool(features, table, table.long())
     with pytest.raises(KERNEL_ERROR, match=r"sparse_max_pool_backward: winner must have shape \[2, 4\], got \[3, 4\]"):
@@ -401,7 +401,7 @@ def test_direct_calls_are_checked(native: None) -> None:
     with pytest.raises(KERNEL_ERROR, match="indices must be distinct, got one site in rows 0 and 1"):
         call.build_rulebook(0 * line, 1, *sizes, True)
     with pytest.raises(KERNEL_ERROR, match=r"sparse_conv: out_to_in must lie in \[-1, 2\), got 2 in row 0"):
-        call.sparse_conv(features, weight, None, table + (table == 1), table)
+        call.sparse_conv(features, weight, None, table + (table == 1), table, False)
 
 
 @pytest.mark.skipif(not LAUNCHED, reason="sites are checked")
@@ -425,11 +425,12 @@ def test_unchecked_numbers_count_as_none(native: None) -> None:
     features, weight = torch.randn(2, 4, generator=generator), torch.randn(3, 3, 4, generator=generator)
     grad, call = torch.randn(2, 3, generator=generator), torch.ops.pred
     assert torch.equal(
-        call.sparse_conv(features, weight, None, wrong, table), call.sparse_conv(features, weight, None, table, table)
+        call.sparse_conv(features, weight, None, wrong, table, False),
+        call.sparse_conv(features, weight, None, table, table, False),
     )
     for actual, expected in zip(
-        call.sparse_conv_backward(grad, features, weight, wrong, wrong, True, True),
-        call.sparse_conv_backward(grad, features, weight, table, table, True, True),
+        call.sparse_conv_backward(grad, features, weight, wrong, wrong, True, True, False),
+        call.sparse_conv_backward(grad, features, weight, table, table, True, True, False),
         strict=True,
     ):
         assert torch.equal(actual, expected)
