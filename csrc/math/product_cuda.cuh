@@ -271,11 +271,12 @@ PRED_DEVICE_ONLY void wait_for_copies() {
 
 // Sizes of a product. Inner: results [m, n] = sum over k of left[m, k] right[n, k], over `segments` pairs of factors.
 // Outer: results [m, n] = sum over rows k of left[k, m] right[k, n], where `splits` blocks share the rows of a
-// segment. Rows hold whole chunks, of which those of k (inner), of m and n (outer) are read.
+// segment. Rows hold whole chunks, of which those of k (inner), of m and n (outer) are read. Apart: each segment has
+// results of its own, the epilogue's splits being segment * splits + split.
 struct ProductSizes {
   int64_t m, n, k;
   int segments, splits;
-  bool tf32;
+  bool tf32, apart;
 };
 
 constexpr int kMostSparseSegments = 512;
@@ -293,10 +294,11 @@ __global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1
   const int64_t tiles_n = (sizes.n + kTileN - 1) / kTileN, tiles_m = (sizes.m + kTileM - 1) / kTileM;
   const int warp = int(threadIdx.x) / kWarp;
   __shared__ int used[Left::kSparse ? kMostSparseSegments : 1], num_used;
-  const bool by_list = Left::kSparse && sizes.segments <= kMostSparseSegments;
+  const bool by_list = Left::kSparse && !sizes.apart && sizes.segments <= kMostSparseSegments;
   const int row0 = warp % (kTileM / kWarpM) * kWarpM, column0 = warp / (kTileM / kWarpM) * kWarpN;
-  for (int64_t task = blockIdx.x; task < tiles_m * tiles_n * sizes.splits; task += gridDim.x) {
-    const int split = int(task / (tiles_m * tiles_n));
+  const int64_t tasks = tiles_m * tiles_n * sizes.splits * (sizes.apart ? sizes.segments : 1);
+  for (int64_t task = blockIdx.x; task < tasks; task += gridDim.x) {
+    const int part = int(task / (tiles_m * tiles_n)), split = part % sizes.splits;
     const int64_t tile = task % (tiles_m * tiles_n), first_m = tile / tiles_n * kTileM,
                   first_n = tile % tiles_n * kTileN;
     const int64_t steps_all = (sizes.k + kTileK<S> - 1) / kTileK<S>;
@@ -317,8 +319,9 @@ __global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1
       }
       __syncthreads();
     }
-    const int64_t steps = (step1 - step0) * (by_list ? num_used : sizes.segments);
-    int place = 0, to_fill = 0;  // of the next stage that is fetched: among the segments, and in `tiles`
+    const int64_t steps = (step1 - step0) * (sizes.apart ? 1 : by_list ? num_used : sizes.segments);
+    int place = sizes.apart ? part / sizes.splits : 0,
+        to_fill = 0;  // of the next stage that is fetched: among the segments, and in `tiles`
     int64_t next_step = step0;
     const auto fetch = [&] {
       const int segment = by_list ? used[place] : place;
@@ -364,7 +367,7 @@ __global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1
       for (int j = 0; j < kPiecesN; ++j) {
         for (int half = 0; half < 2; ++half) {
           const int64_t r = row + 16 * i + 8 * half, c = column + 8 * j;
-          if (r < sizes.m && c < sizes.n) epilogue(r, c, split, sum[i][j][2 * half], sum[i][j][2 * half + 1]);
+          if (r < sizes.m && c < sizes.n) epilogue(r, c, part, sum[i][j][2 * half], sum[i][j][2 * half + 1]);
         }
       }
     }
@@ -374,7 +377,8 @@ __global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1
 
 template <typename S, bool kOuter, class Left, class Right, class Epilogue>
 void launch_product(const ProductSizes& sizes, const Left& left, const Right& right, const Epilogue& epilogue) {
-  const int64_t tiles = (sizes.m + kTileM - 1) / kTileM * ((sizes.n + kTileN - 1) / kTileN) * sizes.splits;
+  const int64_t tiles = (sizes.m + kTileM - 1) / kTileM * ((sizes.n + kTileN - 1) / kTileN) * sizes.splits *
+                        (sizes.apart ? sizes.segments : 1);
   launch_blocks(product_kernel<S, kOuter, Left, Right, Epilogue>, tiles, kProductThreads,
                 2 * kStages * int64_t(sizeof(SharedTile<S, kOuter>)), sizes, left, right, epilogue);
 }
@@ -435,11 +439,12 @@ __global__ void add_splits_kernel(const T* parts, int64_t count, int splits, T* 
   }
 }
 
-// Blocks that share the rows of an outer product, so that each has some hundred rows and the device is busy.
-inline int outer_splits(int64_t m, int64_t n, int64_t rows) {
+// Blocks that share the rows of each of `count` outer products, so that each has some hundred rows and the device is
+// busy.
+inline int outer_splits(int64_t m, int64_t n, int64_t rows, int64_t count = 1) {
   constexpr int64_t kBlocks = 264, kLeastRows = 512;  // two per multiprocessor of a large device
   if (m == 0 || n == 0) return 1;
-  const int64_t tiles = (m + kTileM - 1) / kTileM * ((n + kTileN - 1) / kTileN);
+  const int64_t tiles = (m + kTileM - 1) / kTileM * ((n + kTileN - 1) / kTileN) * count;
   const int64_t wanted = (kBlocks + tiles - 1) / tiles, most = (rows + kLeastRows - 1) / kLeastRows;
   return int(wanted < most ? wanted : most < 1 ? 1 : most);
 }

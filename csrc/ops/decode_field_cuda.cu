@@ -370,7 +370,7 @@ void encode(const FieldArgs<S>& a, const Space<S>& space, int64_t first, int64_t
 template <typename S, class Epilogue>
 void multiply(const FieldArgs<S>& a, const S* rows, int64_t row_stride, int64_t count, const S* weight, int64_t k,
               int64_t outputs, int64_t n, const Epilogue& epilogue) {
-  launch_product<S, false>({count, n, k, 1, 1, a.tf32}, ProductRows<S>{rows, row_stride, count},
+  launch_product<S, false>({count, n, k, 1, 1, a.tf32, false}, ProductRows<S>{rows, row_stride, count},
                            ProductRows<S>{weight, k, outputs}, epilogue);
 }
 
@@ -616,7 +616,7 @@ void add_parameters(const FieldArgs<S>& a, const Space<S>& space, int64_t rows, 
     const TwoRows<S> rights{
         {l == 0 ? rows_of(space.encoding, space.encoding_stride) : rows_of(space.activation[l - 1], space.stride),
          l == 0 ? rows_of(space.encoding_rate, space.rate_stride) : rows_of(space.rate[l - 1], space.stride)}};
-    launch_product<S, true>({out, in, rows, two ? 2 : 1, space.splits[l], a.tf32}, lefts, rights,
+    launch_product<S, true>({out, in, rows, two ? 2 : 1, space.splits[l], a.tf32, false}, lefts, rights,
                             AddToParts<T>{space.parts[l], out, in, set});
     add_columns(left, left_stride, out, rows, set, space.bias_parts[l]);
   }

@@ -50,7 +50,8 @@ void forward(const ProjectArgs<S>& a, const T* weight, S* out, char* workspace, 
   const Space<S> space(a, cells, workspace);
   const int64_t inputs = whole_chunks<S>(a.inputs);
   pack_rows(weight, a.inputs, int64_t(1), a.outputs, a.inputs, inputs, space.weight);
-  launch_product<S, false>({cells, a.outputs, inputs, 1, 1, a.tf32}, readable_rows(a.rows, a.inputs, cells, space.rows),
+  launch_product<S, false>({cells, a.outputs, inputs, 1, 1, a.tf32, false},
+                           readable_rows(a.rows, a.inputs, cells, space.rows),
                            ProductRows<S>{space.weight, inputs, a.outputs}, StoreRows<S>{out, a.outputs});
 }
 
@@ -62,11 +63,11 @@ void backward(const ProjectArgs<S>& a, const T* weight, const ProjectGradients<S
   const ProductRows<S> grad = readable_rows(a.grad, a.outputs, cells, space.grad);
   if (out.rows) {
     pack_rows(weight, int64_t(1), a.inputs, a.inputs, a.outputs, outputs, space.weight);
-    launch_product<S, false>({cells, a.inputs, outputs, 1, 1, a.tf32}, grad,
+    launch_product<S, false>({cells, a.inputs, outputs, 1, 1, a.tf32, false}, grad,
                              ProductRows<S>{space.weight, outputs, a.inputs}, StoreRows<S>{out.rows, a.inputs});
   }
   if (out.weight) {
-    launch_product<S, true>({a.outputs, a.inputs, cells, 1, space.splits, a.tf32}, grad,
+    launch_product<S, true>({a.outputs, a.inputs, cells, 1, space.splits, a.tf32, false}, grad,
                             readable_rows(a.rows, a.inputs, cells, space.rows),
                             AddToParts<T>{space.parts, a.outputs, a.inputs, true});
     launch_threads(add_splits_kernel<T>, a.outputs * a.inputs, static_cast<const T*>(space.parts), a.outputs * a.inputs,

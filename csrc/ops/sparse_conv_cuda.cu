@@ -3,7 +3,7 @@
 //
 // A convolution is one product (math/product_cuda.cuh) with as many segments as there are taps: the rows that a tap
 // reads are gathered into shared memory, and taps that a tile of outputs does not have are left out. Nothing is
-// scattered. The weight's gradient is an outer product per tap, of the same gathered rows.
+// scattered. The weight's gradient is an outer product per tap, of the same gathered rows, all in one launch.
 #include "common/workspace.h"
 #include "math/product_cuda.cuh"
 #include "ops/sparse_conv.h"
@@ -11,18 +11,18 @@
 namespace pred::PRED_ISA {
 namespace {
 
-// Row i of tap `segment`: the one that the table names. Of an outer product, `tap` alone.
+// Row i of tap `segment`: the one that the table names.
 template <typename F>
 struct TableRows {
   static constexpr bool kSparse = true;
   const F* data;
   int64_t stride, numbers;
   const int32_t* table;
-  int64_t taps, rows, tap;
+  int64_t taps, rows;
 
   __device__ const F* row(int64_t i, int segment) const {
     if (i >= rows) return nullptr;
-    const int64_t number = table[i * taps + tap + segment];
+    const int64_t number = table[i * taps + segment];
     return number >= 0 && number < numbers ? data + number * stride : nullptr;
   }
 };
@@ -62,15 +62,15 @@ __global__ void pack_taps_kernel(const S* weight, int64_t taps, int64_t inputs, 
   }
 }
 
-// grad[o, tap, c] = the sum of parts[split, o, c] over splits, in order.
+// grad[o, tap, c] = the sum of parts[tap, split, o, c] over splits, in order.
 template <typename S, typename T = Compute<S>>
-__global__ void write_weight_kernel(const T* parts, int splits, int64_t taps, int64_t tap, int64_t outputs,
-                                    int64_t inputs, S* grad) {
+__global__ void write_weight_kernel(const T* parts, int splits, int64_t taps, int64_t outputs, int64_t inputs,
+                                    S* grad) {
   const int64_t size = outputs * inputs;
-  for (int64_t i = first_thread(); i < size; i += thread_stride()) {
-    const int64_t o = i / inputs, c = i - o * inputs;
+  for (int64_t i = first_thread(); i < taps * size; i += thread_stride()) {
+    const int64_t tap = i / size, at = i - tap * size, o = at / inputs, c = at - o * inputs;
     T sum = T(0);
-    for (int split = 0; split < splits; ++split) sum += parts[split * size + i];
+    for (int split = 0; split < splits; ++split) sum += parts[(tap * splits + split) * size + at];
     narrow_to(grad[(o * taps + tap) * inputs + c], sum);
   }
 }
@@ -86,11 +86,11 @@ struct Space {
   Space(const SparseConvArgs<S>& a, bool of_weight, int64_t rows, int64_t source_rows, char* memory) {
     Workspace space(memory);
     const int64_t inputs = whole_chunks<F>(a.inputs);
-    splits = outer_splits(a.outputs, a.inputs, rows);
+    splits = outer_splits(a.outputs, a.inputs, rows, a.taps);
     source = space.take<F>(source_rows * inputs);
     grad = space.take<F>(of_weight ? rows * whole_chunks<F>(a.outputs) : 0);
     weight = space.take<F>(of_weight ? 0 : a.taps * a.outputs * inputs);
-    parts = space.take<Compute<S>>(of_weight ? splits * a.outputs * a.inputs : 0);
+    parts = space.take<Compute<S>>(of_weight ? a.taps * splits * a.outputs * a.inputs : 0);
     bytes = space.bytes();
   }
 };
@@ -113,8 +113,8 @@ ProductRows<F> factor_rows(const S* rows, int64_t columns, int64_t count, F* spa
 }
 
 template <typename S, typename F = Factor<S>>
-TableRows<F> table_rows(const SparseConvArgs<S>& a, const ProductRows<F>& source, int64_t rows, int64_t tap) {
-  return {source.data, source.stride, source.rows, a.table, a.taps, rows, tap};
+TableRows<F> table_rows(const SparseConvArgs<S>& a, const ProductRows<F>& source, int64_t rows) {
+  return {source.data, source.stride, source.rows, a.table, a.taps, rows};
 }
 
 template <typename S>
@@ -126,7 +126,7 @@ void product(const SparseConvArgs<S>& a, const S* weight, bool transposed, S* ou
   launch_threads(pack_taps_kernel<S, F>, a.taps * a.outputs * stride, weight, a.taps, a.inputs, a.outputs, stride,
                  transposed, space.weight);
   const ProductRows<F> source = factor_rows(a.source, a.inputs, source_rows, space.source);
-  launch_product<F, false>({rows, a.outputs, stride, int(a.taps), 1, a.tf32}, table_rows(a, source, rows, 0),
+  launch_product<F, false>({rows, a.outputs, stride, int(a.taps), 1, a.tf32, false}, table_rows(a, source, rows),
                            TapRows<F>{space.weight, stride, a.outputs}, StoreWithBias<S>{a.bias, out, a.outputs});
 }
 
@@ -137,12 +137,10 @@ void weight(const SparseConvArgs<S>& a, S* grad_weight, char* workspace, int64_t
   const Space<S> space(a, true, rows, source_rows, workspace);
   const ProductRows<F> source = factor_rows(a.source, a.inputs, source_rows, space.source);
   const ProductRows<F> grad = factor_rows(a.grad, a.outputs, rows, space.grad);
-  for (int64_t tap = 0; tap < a.taps; ++tap) {
-    launch_product<F, true>({a.outputs, a.inputs, rows, 1, space.splits, a.tf32}, grad,
-                            table_rows(a, source, rows, tap), AddToParts<T>{space.parts, a.outputs, a.inputs, true});
-    launch_threads(write_weight_kernel<S>, a.outputs * a.inputs, static_cast<const T*>(space.parts), space.splits,
-                   a.taps, tap, a.outputs, a.inputs, grad_weight);
-  }
+  launch_product<F, true>({a.outputs, a.inputs, rows, int(a.taps), space.splits, a.tf32, true}, grad,
+                          table_rows(a, source, rows), AddToParts<T>{space.parts, a.outputs, a.inputs, true});
+  launch_threads(write_weight_kernel<S>, a.taps * a.outputs * a.inputs, static_cast<const T*>(space.parts),
+                 space.splits, a.taps, a.outputs, a.inputs, grad_weight);
 }
 
 template <typename S>
