@@ -81,8 +81,8 @@ sanitize: sanitized
 # CUDA kernels on the CPU, in a copy of the package; csrc/emulation/cuda.h says how. ORDER is that of a block's threads.
 EMULATED := $(CURDIR)/build/emulated
 ORDER ?= shuffled
-CUDA_OPS := composite_alpha composite_rays decode_field resample_rays sample_pdf sdf_to_alpha segment_reduce sparse_conv voxelize \
-	voxelize_hard
+CUDA_OPS := composite_alpha composite_rays decode_field farthest_point_sample resample_rays sample_pdf \
+	sdf_to_alpha segment_reduce sparse_conv voxelize voxelize_hard
 CUDA_TESTS := $(CUDA_OPS:%=tests/ops/test_%.py) tests/ops/test_composites.py tests/ops/test_sampling.py tests/test_emulation.py
 # Products that take minutes when they are emulated: of many rows, or again and again.
 SLOW_TO_EMULATE := test_sparse_conv.py::test_gradcheck test_sparse_conv.py::test_gradients_of_many_rows_are_precise \

@@ -59,3 +59,5 @@ def test_wrong_offsets_touch_no_memory_of_others(native: None, offsets: list[int
     for most in (1, 100):  # per frame
         table, _, counts, slots = torch.ops.pred.voxelize_hard(points, rays, *grid, samples, most)
         assert table.shape[0] >= 1 and counts.sum() == (slots >= 0).sum()
+    picked = torch.ops.pred.farthest_point_sample(points, rays, 4, 1)
+    assert (picked >= -1).all() and (picked < samples).all()
