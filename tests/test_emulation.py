@@ -61,3 +61,9 @@ def test_wrong_offsets_touch_no_memory_of_others(native: None, offsets: list[int
         assert table.shape[0] >= 1 and counts.sum() == (slots >= 0).sum()
     picked = torch.ops.pred.farthest_point_sample(points, rays, 4, 1)
     assert (picked >= -1).all() and (picked < samples).all()
+    queries = (points, rays, torch.rand(6, 3), rays.flip(0))
+    for most in (3, 200):
+        near, distance = torch.ops.pred.knn(*queries, most)
+        assert ((near >= 0) == distance.isfinite()).all() and (near < samples).all()
+        listed, counts = torch.ops.pred.ball_query(*queries, 0.7, most)
+        assert ((listed >= 0).sum(dim=1) == counts).all() and (listed < samples).all()
