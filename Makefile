@@ -83,14 +83,14 @@ sanitize: sanitized
 # CUDA kernels on the CPU, in a copy of the package; csrc/emulation/cuda.h says how. ORDER is that of a block's threads.
 EMULATED := $(CURDIR)/build/emulated
 ORDER ?= shuffled
-CUDA_OPS := composite_alpha composite_rays decode_field resample_rays sample_pdf sdf_to_alpha segment_reduce sparse_conv voxelize \
-	voxelize_hard
+CUDA_OPS := ball_query composite_alpha composite_rays decode_field farthest_point_sample knn resample_rays sample_pdf \
+	sdf_to_alpha segment_reduce sparse_conv voxelize voxelize_hard
 CUDA_TESTS := $(CUDA_OPS:%=tests/ops/test_%.py) tests/ops/test_boxes.py tests/ops/test_composites.py tests/ops/test_sampling.py \
 	tests/test_emulation.py
-# Products that take minutes when they are emulated: of many rows, or again and again.
+# What takes minutes when it is emulated: products of many rows, or again and again, and searches for many queries.
 SLOW_TO_EMULATE := test_sparse_conv.py::test_gradcheck test_sparse_conv.py::test_gradients_of_many_rows_are_precise \
 	test_sparse_conv.py::test_a_thousand_problems_have_the_same_bits_with_two_threads \
-	test_decode_field.py::test_bitwise_equal_for_any_thread_count
+	test_decode_field.py::test_bitwise_equal_for_any_thread_count test_knn.py::test_bitwise_equal_for_any_thread_count
 emulate: $(VENV)/dev.stamp
 	rm -rf $(EMULATED)
 	PRED_CUDA=emulate PRED_SANITIZE=address,undefined PRED_REQUIRE_NATIVE=1 \

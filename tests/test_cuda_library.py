@@ -24,7 +24,7 @@ def listed(*command: str) -> str:
 
 
 def cuda_ops() -> list[str]:
-    found = re.search(r"set\(CUDA_OPS ([^)]*)\)", (ROOT / "CMakeLists.txt").read_text())
+    found = re.search(r"set\(OPS ([^)]*)\)", (ROOT / "CMakeLists.txt").read_text())
     assert found
     return found[1].split()
 

@@ -121,3 +121,11 @@ def test_wrong_offsets_touch_no_memory_of_others(native: None, offsets: list[int
     for box_offsets in (rays, rays.flip(0)):
         inside = torch.ops.pred.points_in_boxes(points, boxes, rays, box_offsets)
         assert ((inside >= -1) & (inside < 200)).all()
+    picked = torch.ops.pred.farthest_point_sample(points, rays, 4, 1)
+    assert (picked >= -1).all() and (picked < samples).all()
+    queries = (points, rays, torch.rand(6, 3), rays.flip(0))
+    for most in (3, 200):
+        near, distance = torch.ops.pred.knn(*queries, most)
+        assert ((near >= 0) == distance.isfinite()).all() and (near < samples).all()
+        listed, counts = torch.ops.pred.ball_query(*queries, 0.7, most)
+        assert ((listed >= 0).sum(dim=1) == counts).all() and (listed < samples).all()

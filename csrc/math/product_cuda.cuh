@@ -439,14 +439,16 @@ __global__ void add_splits_kernel(const T* parts, int64_t count, int splits, T* 
   }
 }
 
-// Blocks that share the rows of each of `count` outer products, so that each has some hundred rows and the device is
-// busy.
+// Blocks that share the rows of each of `count` outer products: so many that the device is busy, each has some hundred
+// rows, and none so many that a running sum of them loses digits.
 inline int outer_splits(int64_t m, int64_t n, int64_t rows, int64_t count = 1) {
-  constexpr int64_t kBlocks = 264, kLeastRows = 512;  // two per multiprocessor of a large device
+  constexpr int64_t kBlocks = 264, kLeastRows = 512, kMostRows = 4096;  // two per multiprocessor of a large device
   if (m == 0 || n == 0) return 1;
   const int64_t tiles = (m + kTileM - 1) / kTileM * ((n + kTileN - 1) / kTileN) * count;
-  const int64_t wanted = (kBlocks + tiles - 1) / tiles, most = (rows + kLeastRows - 1) / kLeastRows;
-  return int(wanted < most ? wanted : most < 1 ? 1 : most);
+  const int64_t busy = (kBlocks + tiles - 1) / tiles, most = (rows + kLeastRows - 1) / kLeastRows,
+                least = (rows + kMostRows - 1) / kMostRows;
+  const int64_t splits = busy < most ? busy : most;
+  return int(splits > least ? splits : least > 1 ? least : 1);
 }
 
 }  // namespace

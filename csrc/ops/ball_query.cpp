@@ -23,14 +23,18 @@ std::tuple<Tensor, Tensor> ball_query(const Tensor& points, const Tensor& batch_
   return PRED_DISPATCH_FLOAT(op, points.scalar_type(), [&] {
     Tensor index = torch::stable::new_empty(in.batch_offsets, {in.num_queries(), max_points});
     Tensor counts = torch::stable::new_empty(in.batch_offsets, {in.num_queries()});
-    const T* query_data = in.queries.const_data_ptr<T>();
     int64_t* index_data = index.mutable_data_ptr<int64_t>();
     int64_t* counts_data = counts.mutable_data_ptr<int64_t>();
     const T squared_radius = T(radius) * T(radius);
     const BallQueryKernels<T>& kernel = ball_query_kernels<T>();
+#ifdef PRED_LAUNCH
+    kernel.search(in.search<T>(), squared_radius, max_points, index_data, counts_data);
+#else
+    const T* query_data = in.queries.const_data_ptr<T>();
     in.search<T>([&](const PointTree<T>& tree, int64_t begin, int64_t end) {
       kernel.search(tree, query_data, squared_radius, max_points, index_data, counts_data, begin, end);
     });
+#endif
     return std::make_tuple(index, counts);
   });
 }
@@ -38,4 +42,4 @@ std::tuple<Tensor, Tensor> ball_query(const Tensor& points, const Tensor& batch_
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) { m.impl("ball_query", TORCH_BOX(&pred::ball_query)); }
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) { PRED_IMPL(m, "ball_query", &pred::ball_query); }

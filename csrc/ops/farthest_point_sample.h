@@ -6,15 +6,30 @@
 //   distance[i] = min over the samples s so far of |p_i - p_s|^2,   next sample = argmax_i distance[i], lowest row
 //   first
 //
-// A new sample changes the distances of few points. Each box of the frame's tree (ops/point_tree.h) keeps the largest
-// distance of its points; a box that is at least so far from the sample is skipped, with equal results.
+// A new sample changes the distances of few points. On the CPU each box of the frame's tree (ops/point_tree.h) keeps
+// the largest distance of its points; a box that is at least so far from the sample is skipped, with equal results.
 #pragma once
 
+#include "common/frames.h"
 #include "common/isa.h"
 #include "ops/point_tree.h"
 
 namespace pred {
 
+#ifdef PRED_LAUNCH
+template <typename T>
+struct FarthestPointSampleArgs {
+  const T* points;  // [3, N]
+  FrameRows frames;
+  int64_t start, num_samples;
+};
+
+template <typename T>
+struct FarthestPointSampleKernels {
+  // All frames: out [B, num_samples], with distance [N] as scratch.
+  void (*sample)(const FarthestPointSampleArgs<T>&, T* distance, int64_t* out);
+};
+#else
 template <typename T>
 struct FarthestPointScratch {
   T* distance;              // [leaves, 32], -1 where there is no point
@@ -28,6 +43,7 @@ struct FarthestPointSampleKernels {
   void (*sample)(const PointTree<T>&, const FarthestPointScratch<T>&, const T* xyz, int64_t num_leaves, int64_t first,
                  int64_t num_samples, int64_t* out);
 };
+#endif
 
 }  // namespace pred
 

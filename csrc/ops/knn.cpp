@@ -22,13 +22,17 @@ std::tuple<Tensor, Tensor> knn(const Tensor& points, const Tensor& batch_offsets
   return PRED_DISPATCH_FLOAT(op, points.scalar_type(), [&] {
     Tensor index = torch::stable::new_empty(in.batch_offsets, {in.num_queries(), k});
     Tensor distance = torch::stable::new_empty(in.points, {in.num_queries(), k});
-    const T* query_data = in.queries.const_data_ptr<T>();
     int64_t* index_data = index.mutable_data_ptr<int64_t>();
     T* distance_data = distance.mutable_data_ptr<T>();
     const KnnKernels<T>& kernel = knn_kernels<T>();
+#ifdef PRED_LAUNCH
+    kernel.search(in.search<T>(), k, index_data, distance_data);
+#else
+    const T* query_data = in.queries.const_data_ptr<T>();
     in.search<T>([&](const PointTree<T>& tree, int64_t begin, int64_t end) {
       kernel.search(tree, query_data, k, index_data, distance_data, begin, end);
     });
+#endif
     return std::make_tuple(index, distance);
   });
 }
@@ -36,4 +40,4 @@ std::tuple<Tensor, Tensor> knn(const Tensor& points, const Tensor& batch_offsets
 }  // namespace
 }  // namespace pred
 
-STABLE_TORCH_LIBRARY_IMPL(pred, CPU, m) { m.impl("knn", TORCH_BOX(&pred::knn)); }
+STABLE_TORCH_LIBRARY_IMPL(pred, PRED_DEVICE, m) { PRED_IMPL(m, "knn", &pred::knn); }

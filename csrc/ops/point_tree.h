@@ -32,6 +32,11 @@ struct PointTree {
   } levels[kTreeLevels];
 };
 
+template <typename T>
+PRED_HOST_DEVICE T squared_length(T dx, T dy, T dz) {
+  return (dx * dx + dy * dy) + dz * dz;
+}
+
 // To the points of a leaf; NaN where it has fewer.
 template <typename T>
 PRED_HOST_DEVICE void leaf_distances(const PointTree<T>& tree, int64_t leaf, const T position[3], T* __restrict out) {
@@ -39,7 +44,7 @@ PRED_HOST_DEVICE void leaf_distances(const PointTree<T>& tree, int64_t leaf, con
   const T x = position[0], y = position[1], z = position[2];
   for (int64_t i = 0; i < kLeafPoints; ++i) {
     const T dx = points[i] - x, dy = points[kLeafPoints + i] - y, dz = points[2 * kLeafPoints + i] - z;
-    out[i] = (dx * dx + dy * dy) + dz * dz;
+    out[i] = squared_length(dx, dy, dz);
   }
 }
 
@@ -60,7 +65,7 @@ PRED_HOST_DEVICE void box_distances(const PointTree<T>& tree, int level, int64_t
     const T dx = gap(boxes[c], boxes[3 * kTreeFan + c], x);
     const T dy = gap(boxes[kTreeFan + c], boxes[4 * kTreeFan + c], y);
     const T dz = gap(boxes[2 * kTreeFan + c], boxes[5 * kTreeFan + c], z);
-    out[c] = (dx * dx + dy * dy) + dz * dz;
+    out[c] = squared_length(dx, dy, dz);
   }
 }
 

@@ -3,6 +3,7 @@
 //
 // One thread owns one point, then one place in the list of points sorted by voxel. Voxels are numbered by a sum over
 // the places that start one.
+#include "common/frames.h"
 #include "common/launch.cuh"
 #include "common/sort.h"
 #include "common/workspace.h"
@@ -59,14 +60,7 @@ __global__ void pack_kernel(VoxelizePoints<S> a, const int64_t* offsets, int64_t
       keys[i] = uint64_t(1) << key_bits;
       continue;
     }
-    int64_t frame = 0, high = num_frames - 1;  // the last that starts at i or before
-    while (frame < high) {
-      const int64_t middle = (frame + high + 1) / 2;
-      if (offsets[middle] <= i)
-        frame = middle;
-      else
-        high = middle - 1;
-    }
+    const int64_t frame = frame_of_row(offsets, num_frames, i);
     keys[i] = voxel_key(a.bits, frame, cell[0], cell[1], cell[2]);
   }
 }

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pred.ops import Neighbors, knn, reference
-from tests.conftest import KERNEL_ERROR
+from tests.conftest import KERNEL_ERROR, require_value_checks
 from tests.ops.clouds import KINDS, cloud, offsets
 
 
@@ -64,6 +64,14 @@ def test_tree_of_four_levels(level: str) -> None:
     points = cloud("lidar", 150000)
     arguments = (points, torch.tensor([0, 150000]), points[::20001] + 0.05, torch.tensor([0, 8]), 24)
     assert same(knn(*arguments), reference.knn(*arguments))
+
+
+@pytest.mark.parametrize("kind", ["normal", "lattice", "not finite"])
+def test_long_lists(native: None, kind: str) -> None:
+    points, queries = cloud(kind, 3000), cloud(kind, 21, seed=1)
+    for k in (127, 128, 129, 1000, 4000):
+        arguments = (points, torch.tensor([0, 400, 3000]), queries, torch.tensor([0, 9, 21]), k)
+        assert same(knn(*arguments), reference.knn(*arguments))
 
 
 def test_distances_are_sums_of_squared_differences(level: str) -> None:
@@ -150,11 +158,12 @@ def test_errors(backend: str) -> None:
 
 def test_direct_calls_are_checked(native: None) -> None:
     points, batch, call = cloud("normal", 10), torch.tensor([0, 10]), torch.ops.pred.knn
-    with pytest.raises(KERNEL_ERROR, match="knn: batch_offsets must ascend from 0 to N=10"):
-        call(points, torch.tensor([0, 12]), points, batch, 3)
-    with pytest.raises(KERNEL_ERROR, match="knn: query_offsets must ascend from 0 to M=10"):
-        call(points, batch, points, torch.tensor([0, 9]), 3)
     with pytest.raises(KERNEL_ERROR, match="knn: query_offsets must have shape \\[2\\], got"):
         call(points, batch, points, torch.tensor([0, 5, 10]), 3)
     with pytest.raises(KERNEL_ERROR, match="knn: k must not be negative, got -1"):
         call(points, batch, points, batch, -1)
+    require_value_checks("native")
+    with pytest.raises(KERNEL_ERROR, match="knn: batch_offsets must ascend from 0 to N=10"):
+        call(points, torch.tensor([0, 12]), points, batch, 3)
+    with pytest.raises(KERNEL_ERROR, match="knn: query_offsets must ascend from 0 to M=10"):
+        call(points, batch, points, torch.tensor([0, 9]), 3)
