@@ -429,25 +429,28 @@ struct AddToParts {
   }
 };
 
-// out[i] = the sum of parts[split, i] over splits, in order.
+// out[i] = the sum of parts[split, i] over splits, in order; in float64, as there may be many.
 template <typename T>
 __global__ void add_splits_kernel(const T* parts, int64_t count, int splits, T* out) {
   for (int64_t i = first_thread(); i < count; i += thread_stride()) {
-    T sum = T(0);
-    for (int split = 0; split < splits; ++split) sum += parts[split * count + i];
-    out[i] = sum;
+    double sum = 0;
+    for (int split = 0; split < splits; ++split) sum += double(parts[split * count + i]);
+    out[i] = T(sum);
   }
 }
 
-// Blocks that share the rows of each of `count` outer products: so many that the device is busy, each has some hundred
-// rows, and none so many that a running sum of them loses digits.
+// Blocks that share the rows of each of `count` outer products: so many that the device is busy and each has some
+// hundred rows, but no more than a running sum can take without losing digits, as long as there is memory for the
+// parts.
 inline int outer_splits(int64_t m, int64_t n, int64_t rows, int64_t count = 1) {
-  constexpr int64_t kBlocks = 264, kLeastRows = 512, kMostRows = 4096;  // two per multiprocessor of a large device
-  if (m == 0 || n == 0) return 1;
+  constexpr int64_t kBlocks = 264, kLeastRows = 512,
+                    kMostRows = 1024;  // two blocks per multiprocessor of a large device
+  constexpr int64_t kPartsElements = int64_t(1) << 26;
+  if (m == 0 || n == 0 || count == 0) return 1;
   const int64_t tiles = (m + kTileM - 1) / kTileM * ((n + kTileN - 1) / kTileN) * count;
-  const int64_t busy = (kBlocks + tiles - 1) / tiles, most = (rows + kLeastRows - 1) / kLeastRows,
-                least = (rows + kMostRows - 1) / kMostRows;
-  const int64_t splits = busy < most ? busy : most;
+  const int64_t busy = (kBlocks + tiles - 1) / tiles, most = (rows + kLeastRows - 1) / kLeastRows;
+  const int64_t precise = (rows + kMostRows - 1) / kMostRows, fit = kPartsElements / (m * n * count);
+  const int64_t least = precise < fit ? precise : fit, splits = busy < most ? busy : most;
   return int(splits > least ? splits : least > 1 ? least : 1);
 }
 

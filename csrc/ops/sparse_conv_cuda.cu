@@ -69,9 +69,9 @@ __global__ void write_weight_kernel(const T* parts, int splits, int64_t taps, in
   const int64_t size = outputs * inputs;
   for (int64_t i = first_thread(); i < taps * size; i += thread_stride()) {
     const int64_t tap = i / size, at = i - tap * size, o = at / inputs, c = at - o * inputs;
-    T sum = T(0);
-    for (int split = 0; split < splits; ++split) sum += parts[(tap * splits + split) * size + at];
-    narrow_to(grad[(o * taps + tap) * inputs + c], sum);
+    double sum = 0;  // there may be many
+    for (int split = 0; split < splits; ++split) sum += double(parts[(tap * splits + split) * size + at]);
+    narrow_to(grad[(o * taps + tap) * inputs + c], T(sum));
   }
 }
 
