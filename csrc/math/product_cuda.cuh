@@ -57,11 +57,16 @@ struct alignas(16) SharedTile {
 
 // --- Tensor cores --------------------------------------------------------------------------------
 // mma_...: d += a b for one piece, in the layout of the instructions: lane 4 g + t has d of rows g and g + 8, columns
-// 2 t and 2 t + 1.
+// 2 t and 2 t + 1. They round sums toward zero.
 // load_matrices: four matrices of 8 x 8 pairs of bytes in shared memory, of which lane 8 i + r names row r of matrix i
 // (16 bytes, aligned). Lane 4 g + t gets elements 2 t and 2 t + 1 of row g of each, or of column g of its transpose.
 #if !defined(__CUDACC__)
 constexpr bool kTensorCores = true;
+
+inline float round_toward_zero(double x) {
+  const float near = float(x);
+  return __builtin_fabs(double(near)) > __builtin_fabs(x) ? __builtin_nextafterf(near, 0.0f) : near;
+}
 
 // Emulated: the lanes give each other their fragments.
 template <int kDepth, class Multiply>
@@ -78,21 +83,23 @@ inline void emulate_mma(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint
   const int g = int(threadIdx.x % kWarp) / 4, t = int(threadIdx.x % kWarp) % 4;
   for (int i = 0; i < 4; ++i) {
     const int half = i / 2, column = 2 * t + i % 2;  // row g + 8 half
+    double sum = double(d[i]);
     for (int part = 0; part < 4; ++part) {
-      d[i] += multiply(all_a[half][4 * g + part], all_b[0][4 * column + part]);
-      d[i] += multiply(all_a[2 + half][4 * g + part], all_b[1][4 * column + part]);
+      sum += multiply(all_a[half][4 * g + part], all_b[0][4 * column + part]);
+      sum += multiply(all_a[2 + half][4 * g + part], all_b[1][4 * column + part]);
     }
+    d[i] = round_toward_zero(sum);
   }
 }
 inline void mma_bfloat16(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
   emulate_mma<16>(d, a, b0, b1, [](uint32_t x, uint32_t y) {
-    return widen_bfloat16<float>(x & 0xffffu) * widen_bfloat16<float>(y & 0xffffu) +
-           bits_as<float>(x & 0xffff0000u) * bits_as<float>(y & 0xffff0000u);
+    return double(widen_bfloat16<float>(x & 0xffffu)) * double(widen_bfloat16<float>(y & 0xffffu)) +
+           double(bits_as<float>(x & 0xffff0000u)) * double(bits_as<float>(y & 0xffff0000u));
   });
 }
 inline void mma_tf32(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
   emulate_mma<8>(d, a, b0, b1, [](uint32_t x, uint32_t y) {
-    return bits_as<float>(x & 0xffffe000u) * bits_as<float>(y & 0xffffe000u);
+    return double(bits_as<float>(x & 0xffffe000u)) * double(bits_as<float>(y & 0xffffe000u));
   });
 }
 template <bool kTranspose>
@@ -201,16 +208,23 @@ PRED_DEVICE_ONLY void multiply_stage(const SharedTile<S, kOuter>& left, const Sh
         load_left(left, row0 + 16 * i, k, a);
         if constexpr (std::is_same_v<S, float>) split_tf32(a, a_rest);
 #pragma unroll
-        for (int j = 0; j < kPiecesN; ++j) {
-          const int at = j % 2 * 2;
+        for (int pair = 0; pair < kPiecesN / 2; ++pair) {
           if constexpr (std::is_same_v<S, float>) {
+            // From 0, and added up by ordinary sums: what the instructions round off stays a part of eight products.
+            float part[2][4] = {};
             if (!tf32) {
-              mma_tf32(sum[i][j], a_rest, b[j / 2][at], b[j / 2][at + 1]);
-              mma_tf32(sum[i][j], a, b_rest[j / 2][at], b_rest[j / 2][at + 1]);
+#pragma unroll
+              for (int j = 0; j < 2; ++j) mma_tf32(part[j], a_rest, b[pair][2 * j], b[pair][2 * j + 1]);
+#pragma unroll
+              for (int j = 0; j < 2; ++j) mma_tf32(part[j], a, b_rest[pair][2 * j], b_rest[pair][2 * j + 1]);
             }
-            mma_tf32(sum[i][j], a, b[j / 2][at], b[j / 2][at + 1]);
+#pragma unroll
+            for (int j = 0; j < 2; ++j) mma_tf32(part[j], a, b[pair][2 * j], b[pair][2 * j + 1]);
+#pragma unroll
+            for (int e = 0; e < 8; ++e) sum[i][2 * pair + e / 4][e % 4] += part[e / 4][e % 4];
           } else {
-            mma_bfloat16(sum[i][j], a, b[j / 2][at], b[j / 2][at + 1]);
+#pragma unroll
+            for (int j = 0; j < 2; ++j) mma_bfloat16(sum[i][2 * pair + j], a, b[pair][2 * j], b[pair][2 * j + 1]);
           }
         }
       }

@@ -170,7 +170,7 @@ def evaluate(
 
 def steps(like: Tensor) -> Tensor:
     """-1 to 2 in multiples of 1/64, which every dtype holds, so that all dtypes compute the same thing."""
-    return (torch.linspace(-64, 128, like.numel()).round() / 64).reshape(like.shape).to(like.dtype)
+    return (torch.linspace(-64, 128, like.numel()).round() / 64).reshape(like.shape).to(like)
 
 
 def grads(
