@@ -19,6 +19,7 @@ from torch import Tensor
 from benchmarks import cases
 from benchmarks.case import BACKWARD, FORWARD, Case, Function, Phase, Variant
 from benchmarks.cases import POINT_RANGE_M, Sizes
+from benchmarks.ops_sampling import plain_gather
 from benchmarks.report import Target
 from pred import ops
 from pred.models.field import FieldConfig, FieldDecoder
@@ -105,11 +106,11 @@ def _call(function: Callable[..., DecodedField], with_gradient: bool, options: d
     return run
 
 
-def _network(bev: Tensor, points: Tensor, layers: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+def _network(bev: Tensor, points: Tensor, layers: Sequence[Tensor], twice: bool) -> tuple[Tensor, Tensor]:
     """As one would write it: gather, concatenate, MLP."""
     low, high = points.new_tensor(POINT_RANGE_M).view(2, 3)
     position = (points - (low + high) / 2) / ((high - low) / 2)
-    features = F.grid_sample(bev, position[:, None, :, :2], align_corners=False)[:, :, 0].transpose(1, 2)
+    features = plain_gather(bev, position[..., :2], twice)
     octaves = 2.0 ** torch.arange(FREQUENCIES, device=points.device)
     angles = (position[..., None, :] * octaves[:, None]).flatten(-2)
     values = torch.cat([features, position, angles.sin(), angles.cos()], dim=-1)
@@ -122,11 +123,11 @@ def _network(bev: Tensor, points: Tensor, layers: Sequence[Tensor]) -> tuple[Ten
 def _plain(with_gradient: bool) -> Function:
     def run(bev: Tensor, points: Tensor, *layers: Tensor) -> tuple[Tensor, ...]:
         if not with_gradient:
-            return _network(bev, points, layers)
+            return _network(bev, points, layers, False)
         learns = torch.is_grad_enabled()
         with torch.enable_grad():
             points = points.detach().requires_grad_()
-            sdf, semantics = _network(bev, points, layers)
+            sdf, semantics = _network(bev, points, layers, True)
             (gradient,) = torch.autograd.grad(sdf.sum(), points, create_graph=learns)
         return sdf, semantics, gradient
 
@@ -136,7 +137,7 @@ def _plain(with_gradient: bool) -> Function:
 def _functional(with_gradient: bool) -> Function:
     def run(bev: Tensor, points: Tensor, *layers: Tensor) -> tuple[Tensor, ...]:
         def total(points: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-            sdf, semantics = _network(bev, points, layers)
+            sdf, semantics = _network(bev, points, layers, with_gradient)
             return sdf.sum(), (sdf, semantics)
 
         if not with_gradient:

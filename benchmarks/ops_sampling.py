@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import torch
@@ -192,6 +193,26 @@ def _volume_text(volume: Tensor) -> str:
 def _formats(function: Function, map_: Tensor, grid: Tensor) -> dict[str, Variant]:
     """Plain PyTorch on both memory formats of the map."""
     return {"channels_last": Variant(function), "channels_first": Variant(function, (map_.contiguous(), grid))}
+
+
+@functools.cache
+def grid_sample_is_twice_differentiable() -> bool:
+    """Not before torch 2.13."""
+    map_ = torch.zeros(1, 1, 2, 2)
+    grid = torch.zeros(1, 1, 1, 2, requires_grad=True)
+    try:
+        (slope,) = torch.autograd.grad(F.grid_sample(map_, grid, align_corners=False).sum(), grid, create_graph=True)
+        torch.autograd.grad(slope.sum(), grid)
+    except RuntimeError:
+        return False
+    return True
+
+
+def plain_gather(bev: Tensor, grid: Tensor, twice: bool) -> Tensor:  # [B, N, C]
+    """`F.grid_sample`; four plain gathers where it must be differentiated twice and torch cannot."""
+    if twice and not grid_sample_is_twice_differentiable():
+        return reference.sample_bev(bev, grid)
+    return _grid_sample(bev, grid)
 
 
 def _eager_sample_bev(bev: Tensor, grid: Tensor) -> tuple[Tensor, ...]:

@@ -17,7 +17,7 @@ import pytest
 import torch
 from PIL import Image
 
-from benchmarks import bench_ops, bench_step, cases, models
+from benchmarks import bench_ops, bench_step, cases, models, ops_sampling
 from benchmarks.bench_ops import expected_results, make_cases, run_phase
 from benchmarks.case import BACKWARD, BACKWARD_ALONE, FORWARD, SECOND, SECOND_ALONE, Phase, Variant
 from benchmarks.cases import PAPER, REAL, TINY, Sizes
@@ -221,6 +221,17 @@ def test_a_step_that_does_not_fit_is_made_smaller(monkeypatch: pytest.MonkeyPatc
     assert tried == [3072, 3072, 2304, 2304, 1728, 1728]
     assert [(row.contender, row.items) for row in rows] == [("reference", 3456), ("eager", 3456)]
     assert "step: out of the GPU's memory, now with 2304 + 2304 rays" in steps
+
+
+def test_plain_gather_without_a_second_derivative_of_grid_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+    bev, grid = cases.bev_map(3, 5), 2 * torch.rand(1, 20, 2, generator=torch.Generator().manual_seed(0)) - 1
+    expected = ops_sampling.plain_gather(bev, grid, twice=True)
+    monkeypatch.setattr(ops_sampling, "grid_sample_is_twice_differentiable", lambda: False)
+    torch.testing.assert_close(ops_sampling.plain_gather(bev, grid, twice=True), expected)
+    leaf = grid.requires_grad_()
+    (slope,) = torch.autograd.grad(ops_sampling.plain_gather(bev, leaf, twice=True).sum(), leaf, create_graph=True)
+    (second,) = torch.autograd.grad(slope.square().sum(), leaf)
+    assert second.abs().max() > 0
 
 
 def test_a_wrong_result_gets_no_time() -> None:

@@ -320,7 +320,7 @@ __global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1
     if (by_list) {
       for (int segment = warp; segment < sizes.segments; segment += kProductThreads / kWarp) {
         bool any = false;
-        for (int i = lane_number(); i < kTileM; i += kWarp) any = any || left.row(first_m + i, segment);
+        for (int i = lane_number(); i < kTileM; i += kWarp) any |= left.row(first_m + i, segment) != nullptr;
         any = __any_sync(kWholeWarp, any);
         if (lane_number() == 0) used[segment] = any;
       }
@@ -371,7 +371,9 @@ __global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1
       __syncthreads();  // this stage is there, and the one before has been read
       if (step + kStages - 1 < steps) fetch();
       commit_copies();
-      multiply_stage<S, kOuter>(tiles[stage][0], tiles[stage][1], row0, column0, sizes.tf32, sum);
+      if (row0 < sizes.m - first_m && column0 < sizes.n - first_n) {
+        multiply_stage<S, kOuter>(tiles[stage][0], tiles[stage][1], row0, column0, sizes.tf32, sum);
+      }
       stage = stage + 1 < kStages ? stage + 1 : 0;
     }
     const int64_t row = first_m + row0 + lane_number() / 4, column = first_n + column0 + lane_number() % 4 * 2;

@@ -99,7 +99,7 @@ struct Space {
     }
   }
 
-  static constexpr int kSumSplits = 64;
+  static constexpr int kSumSplits = 256;
 };
 
 // --- Parameters ----------------------------------------------------------------------------------
@@ -592,7 +592,9 @@ __global__ void column_sums_kernel(const S* rows, int64_t stride, int64_t column
   for (int64_t i = first_thread(); i < splits * columns; i += thread_stride()) {
     const int64_t split = i / columns, c = i - split * columns;
     T sum = T(0);
-    for (int64_t r = count * split / splits; r < count * (split + 1) / splits; ++r) sum += widen(rows[r * stride + c]);
+    const int64_t end = count * (split + 1) / splits;
+#pragma unroll 8
+    for (int64_t r = count * split / splits; r < end; ++r) sum += widen(rows[r * stride + c]);
     parts[i] = set ? sum : parts[i] + sum;
   }
 }
