@@ -31,9 +31,14 @@ void launch_blocks(void (*kernel)(Parameters...), int64_t blocks, int threads, i
   const unsigned grid = unsigned(blocks < kMostBlocks ? blocks : kMostBlocks);
 #ifdef __CUDACC__
   constexpr int64_t kAlwaysThere = 48 * 1024;
-  if (shared > kAlwaysThere) cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(shared));
-  kernel<<<grid, threads, size_t(shared), static_cast<cudaStream_t>(current_stream())>>>(arguments...);
-  const cudaError_t error = cudaGetLastError();
+  cudaError_t error = cudaSuccess;
+  if (shared > kAlwaysThere) {
+    error = cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(shared));
+  }
+  if (error == cudaSuccess) {
+    kernel<<<grid, threads, size_t(shared), static_cast<cudaStream_t>(current_stream())>>>(arguments...);
+    error = cudaGetLastError();
+  }
   if (error != cudaSuccess) throw std::runtime_error(std::string("pred: CUDA launch: ") + cudaGetErrorString(error));
 #else
   emulation::run(grid, unsigned(threads), shared, [&] { kernel(arguments...); });
@@ -67,6 +72,11 @@ PRED_DEVICE_ONLY void* dynamic_shared() {
 #else
   return emulation::dynamic_shared_memory();
 #endif
+}
+
+// a / b of numbers that are not negative, which mostly have 32 bits: others take some 100 instructions.
+PRED_DEVICE_ONLY int64_t divide(int64_t a, int64_t b) {
+  return ((a | b) >> 32) == 0 ? int64_t(uint32_t(a) / uint32_t(b)) : a / b;
 }
 
 PRED_DEVICE_ONLY int lane_number() { return int(threadIdx.x % kWarp); }

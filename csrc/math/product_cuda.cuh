@@ -410,7 +410,7 @@ template <typename From, typename S>
 __global__ void pack_kernel(const From* from, int64_t row_stride, int64_t column_stride, int64_t rows, int64_t columns,
                             int64_t stride, S* to) {
   for (int64_t i = first_thread(); i < rows * stride; i += thread_stride()) {
-    const int64_t row = i / stride, column = i - row * stride;
+    const int64_t row = divide(i, stride), column = i - row * stride;
     narrow_to(to[i],
               column < columns ? Compute<S>(widen(from[row * row_stride + column * column_stride])) : Compute<S>(0));
   }
@@ -431,7 +431,8 @@ ProductRows<S> readable_rows(const S* rows, int64_t columns, int64_t count, S* s
   return {space, stride, count};
 }
 
-// Adds to parts [splits, m, n], or sets them.
+// Adds to parts [splits, m, n], or sets them. One thread adds to each; atomically, so that it need not wait for what is
+// there.
 template <typename T>
 struct AddToParts {
   T* parts;
@@ -440,8 +441,15 @@ struct AddToParts {
 
   __device__ void operator()(int64_t row, int64_t column, int split, T value, T next) const {
     T* to = parts + (split * m + row) * n + column;
-    to[0] = set ? value : to[0] + value;
-    if (column + 1 < n) to[1] = set ? next : to[1] + next;
+    put(to, value);
+    if (column + 1 < n) put(to + 1, next);
+  }
+
+  __device__ void put(T* to, T value) const {
+    if (set)
+      *to = value;
+    else
+      atomicAdd(to, value);
   }
 };
 

@@ -330,8 +330,10 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
 
     const int64_t width = in.args.map.channels;
     const bool slopes = need_projected && grad.gradient;
+    // What kernels that are launched kept of the chain is read as it is, where its rows have the map's width.
+    const bool chain_serves = kLaunch && slopes && saved.chain && in.stride == width;
     const AlongMap along{torch::stable::new_empty(in.map, {need_projected ? in.num_samples : 0, width}),
-                         torch::stable::new_empty(in.map, {slopes ? in.num_samples : 0, width}),
+                         torch::stable::new_empty(in.map, {slopes && !chain_serves ? in.num_samples : 0, width}),
                          torch::stable::new_empty(in.points, {slopes ? in.num_samples : 0, 2})};
     Tensor out_points = torch::stable::new_empty(in.points, {need_points ? frames : 0, count, 3});
     Tensor out_parameters = torch::stable::new_empty(in.parameters, {need_parameters ? parameters.size(0) : 0});
@@ -341,7 +343,7 @@ std::tuple<Tensor, Tensor, Tensor> decode_field_backward(
     if (need_projected) {
       in.make_grid();
       in.args.map.grad = storage<S>(along.rows);
-      in.args.map.grad_along = slopes ? storage<S>(along.slopes) : nullptr;
+      in.args.map.grad_along = chain_serves ? saved.chain : slopes ? storage<S>(along.slopes) : nullptr;
       in.args.map.grad_grad_grid = slopes ? storage<T>(along.directions) : nullptr;
       out_map = SampleBev::scatter<S>(op, in.map, in.args.map, false, deterministic, nullptr);
     }

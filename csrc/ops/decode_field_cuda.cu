@@ -165,7 +165,7 @@ template <typename S, typename T = Compute<S>>
 __global__ void encode_kernel(Range<T> range, Space<S> space, int64_t rows) {
   const int64_t per_row = 3 + space.angles, used = kFieldParts<S> * space.encoding_width;
   for (int64_t i = first_thread(); i < rows * per_row; i += thread_stride()) {
-    const int64_t r = i / per_row, part = i - r * per_row;
+    const int64_t r = divide(i, per_row), part = i - r * per_row;
     S* row = space.encoding + r * space.encoding_stride;
     T position[3];
     range.position(r, position);
@@ -189,7 +189,7 @@ template <typename S, typename T = Compute<S>>
 __global__ void encode_rate_kernel(Space<S> space, int64_t rows) {
   const int64_t per_row = 3 + space.angles;
   for (int64_t i = first_thread(); i < rows * per_row; i += thread_stride()) {
-    const int64_t r = i / per_row, part = i - r * per_row;
+    const int64_t r = divide(i, per_row), part = i - r * per_row;
     S* row = space.encoding_rate + r * space.rate_stride;
     if (part < 3) {
       narrow_to(row[part], space.direction[3 * r + part]);
@@ -249,20 +249,13 @@ void gather(const FieldArgs<S>& a, const Space<S>& space, int64_t first, int64_t
 }
 
 // --- Epilogues -----------------------------------------------------------------------------------
-// Calls body(element, column, value) for a pair of results in rows of hidden width. Columns that fill up a row are 0.
-template <typename S, class Body>
-PRED_DEVICE_ONLY void for_pair(int64_t row, int64_t column, int64_t stride, Compute<S> value, Compute<S> next,
-                               const Body& body) {
-  body(row * stride + column, column, value);
-  body(row * stride + column + 1, column + 1, next);
-}
-
 // s from a: 1 - exp(-beta a).
-template <typename S, typename T = Compute<S>>
-PRED_DEVICE_ONLY T slope_of(const ExpScale<T>& beta, S activation) {
-  return -exp_nonpositive(beta, -widen(activation)).expm1;
+template <typename T>
+PRED_DEVICE_ONLY T slope_of(const ExpScale<T>& beta, T activation) {
+  return -exp_nonpositive(beta, -activation).expm1;
 }
 
+// Results come in pairs of columns of rows of hidden width; those that fill up a row are 0.
 template <typename S, typename T = Compute<S>>
 struct Activate {
   SoftplusScale<T> beta;
@@ -272,11 +265,16 @@ struct Activate {
   S* out;
 
   __device__ void operator()(int64_t row, int64_t column, int, T value, T next) const {
-    for_pair<S>(row, column, stride, value, next, [&](int64_t at, int64_t c, T sum) {
-      if (c >= width) return narrow_to(out[at], T(0));
-      const T z = sum + bias[c];
-      narrow_to(out[at], softplus(beta, gathered ? z + widen(gathered[at]) : z).value);
-    });
+    const int64_t at = row * stride + column;
+    T result[2] = {value, next}, from_map[2] = {};
+    if (gathered) load_constant_pack<2>(gathered + at, from_map);
+#pragma unroll
+    for (int v = 0; v < 2; ++v) {
+      const bool there = column + v < width;
+      const T z = there ? result[v] + bias[column + v] : T(0);
+      result[v] = there ? softplus(beta, gathered ? z + from_map[v] : z).value : T(0);
+    }
+    store_pack<2>(out + at, result);
   }
 };
 
@@ -289,9 +287,12 @@ struct Chain {
   S* out;
 
   __device__ void operator()(int64_t row, int64_t column, int, T value, T next) const {
-    for_pair<S>(row, column, stride, value, next, [&](int64_t at, int64_t c, T sum) {
-      narrow_to(out[at], c < width ? sum * slope_of(beta, activation[at]) : T(0));
-    });
+    const int64_t at = row * stride + column;
+    T result[2] = {value, next}, a[2];
+    load_constant_pack<2>(activation + at, a);
+#pragma unroll
+    for (int v = 0; v < 2; ++v) result[v] = column + v < width ? result[v] * slope_of(beta, a[v]) : T(0);
+    store_pack<2>(out + at, result);
   }
 };
 
@@ -305,13 +306,21 @@ struct Tangent {
   S *rate, *back;
 
   __device__ void operator()(int64_t row, int64_t column, int, T value, T next) const {
-    for_pair<S>(row, column, stride, value, next, [&](int64_t at, int64_t c, T sum) {
-      const bool there = c < width;
-      const T y = gathered && there ? sum + widen(gathered[at]) : sum;
-      const T s = there ? slope_of(beta, activation[at]) : T(0);
-      narrow_to(rate[at], there ? s * y : T(0));
-      narrow_to(back[at], there ? widen(chain[at]) * y * (beta_value - beta_value * s) : T(0));
-    });
+    const int64_t at = row * stride + column;
+    T y[2] = {value, next}, from_map[2] = {}, a[2], g[2], q[2];
+    load_constant_pack<2>(activation + at, a);
+    load_constant_pack<2>(chain + at, g);
+    if (gathered) load_constant_pack<2>(gathered + at, from_map);
+#pragma unroll
+    for (int v = 0; v < 2; ++v) {
+      const bool there = column + v < width;
+      if (gathered) y[v] += from_map[v];
+      const T s = slope_of(beta, a[v]);
+      q[v] = there ? g[v] * y[v] * (beta_value - beta_value * s) : T(0);
+      y[v] = there ? s * y[v] : T(0);
+    }
+    store_pack<2>(rate + at, y);
+    store_pack<2>(back + at, q);
   }
 };
 
@@ -325,11 +334,16 @@ struct Reverse {
   S* back;
 
   __device__ void operator()(int64_t row, int64_t column, int, T value, T next) const {
-    for_pair<S>(row, column, stride, value, next, [&](int64_t at, int64_t c, T sum) {
-      if (c >= width) return narrow_to(back[at], T(0));
-      const T x = sum * slope_of(beta, activation[at]);
-      narrow_to(back[at], has_tangents ? x + widen(back[at]) : x);
-    });
+    const int64_t at = row * stride + column;
+    T x[2] = {value, next}, a[2], q[2] = {};
+    load_constant_pack<2>(activation + at, a);
+    if (has_tangents) load_pack<2>(back + at, q);
+#pragma unroll
+    for (int v = 0; v < 2; ++v) {
+      x[v] *= slope_of(beta, a[v]);
+      x[v] = column + v >= width ? T(0) : has_tangents ? x[v] + q[v] : x[v];
+    }
+    store_pack<2>(back + at, x);
   }
 };
 
@@ -395,8 +409,8 @@ template <typename S, typename T = Compute<S>>
 __global__ void last_of_chain_kernel(ExpScale<T> beta, const T* sdf_row, T sdf_scale, const S* activation,
                                      int64_t width, int64_t columns, int64_t stride, int64_t rows, S* out) {
   for (int64_t i = first_thread(); i < rows * columns; i += thread_stride()) {
-    const int64_t row = i / columns, c = i - row * columns, at = row * stride + c;
-    narrow_to(out[at], c < width ? slope_of(beta, activation[at]) * (sdf_row[c] * sdf_scale) : T(0));
+    const int64_t row = divide(i, columns), c = i - row * columns, at = row * stride + c;
+    narrow_to(out[at], c < width ? slope_of(beta, widen(activation[at])) * (sdf_row[c] * sdf_scale) : T(0));
   }
 }
 
@@ -525,7 +539,7 @@ template <typename S, typename T = Compute<S>>
 __global__ void read_cotangents_kernel(FieldCotangents<S> grad, Range<T> range, T sdf_scale, int64_t classes,
                                        Space<S> space, int64_t first, int64_t rows, T* directions) {
   for (int64_t i = first_thread(); i < rows * space.output_stride; i += thread_stride()) {
-    const int64_t row = i / space.output_stride, c = i - row * space.output_stride, sample = first + row;
+    const int64_t row = divide(i, space.output_stride), c = i - row * space.output_stride, sample = first + row;
     T value = T(0);
     if (c == 0 && grad.sdf) value = grad.sdf[sample] * sdf_scale;
     if (c > 0 && c <= classes && grad.semantics) value = grad.semantics[sample * classes + c - 1];
@@ -666,6 +680,8 @@ void backward(const FieldArgs<S>& a, const T* parameter_data, const FieldSaved<S
        first += kChunkRows) {  // once for the gradients of nothing
     const int64_t rows = num_samples - first < kChunkRows ? num_samples - first : kChunkRows;
     if (saved.activation) space.use_saved(saved, num_samples, first, saved.chain != nullptr);
+    const bool in_place = out.along_map && space.stride == space.width;
+    if (in_place) space.back[0] = out.along_map + first * space.width;
     encode(a, space, first, rows);
     launch_threads(read_cotangents_kernel<S>, rows * space.output_stride, grad, range_of(a, first), a.sdf_scale,
                    a.num_outputs - 1, space, first, rows, out.directions);
@@ -689,7 +705,7 @@ void backward(const FieldArgs<S>& a, const T* parameter_data, const FieldSaved<S
     const auto copy_out = [&](const S* from, S* to) {
       pack_rows(from, space.stride, int64_t(1), rows, space.width, space.width, to + first * space.width);
     };
-    if (out.along_map) copy_out(space.back[0], out.along_map);
+    if (out.along_map && !in_place) copy_out(space.back[0], out.along_map);
     if (out.along_slope) copy_out(space.chain[0], out.along_slope);
   }
   if (out.parameters) write_parameters(a, space, parameters, has_tangents, out.parameters);

@@ -27,6 +27,22 @@ PRED_DEVICE_ONLY void load_pack(const S* from, Compute<S> (&value)[V]) {
   for (int v = 0; v < V; ++v) value[v] = from ? widen(pack.x[v]) : Compute<S>(0);
 }
 
+// The same of memory that the kernel does not write, so that loads may go ahead of stores.
+template <int V, typename S>
+PRED_DEVICE_ONLY void load_constant_pack(const S* from, Compute<S> (&value)[V]) {
+  Pack<S, V> pack;
+#ifdef __CUDA_ARCH__
+  using Word = std::conditional_t<sizeof(pack) == 4, unsigned, std::conditional_t<sizeof(pack) == 8, uint2, uint4>>;
+  static_assert(sizeof(Word) == sizeof(pack));
+  const Word word = __ldg(reinterpret_cast<const Word*>(from));
+  __builtin_memcpy(&pack, &word, sizeof word);
+#else
+  pack = *reinterpret_cast<const Pack<S, V>*>(from);
+#endif
+#pragma unroll
+  for (int v = 0; v < V; ++v) value[v] = widen(pack.x[v]);
+}
+
 template <int V, typename S>
 PRED_DEVICE_ONLY void store_pack(S* to, const Compute<S> (&value)[V]) {
   Pack<S, V> pack;
@@ -44,10 +60,6 @@ struct Group {
   __device__ int64_t first() const { return first_thread() / size; }
   __device__ int64_t stride() const { return thread_stride() / size; }
 };
-
-PRED_DEVICE_ONLY int64_t divide(int64_t a, int64_t b) {
-  return ((a | b) >> 32) == 0 ? int64_t(uint32_t(a) / uint32_t(b)) : a / b;  // the latter takes some 100 instructions
-}
 
 // The rows of the map between which a sample lies; null outside of it.
 template <typename S, int Axes>
