@@ -31,6 +31,8 @@ OWN_ROWS, OWN_SIZE = {"cpu": 3840, "cuda": 1 << 19}, 256
 SLOW_CALL_S = 0.3
 GPU_CACHE_BYTES = 256 << 20
 """Written before each timed call on a GPU, so that inputs come from its memory: more than any GPU's cache holds."""
+GPU_HEAD_START_CYCLES = 2_000_000
+"""For which a GPU does nothing before each timed call (a millisecond), while the host launches its kernels."""
 GPU_CALLS = 200
 """At most, in one turn."""
 RESULTS = "benchmarks/results"  # files of earlier runs do not make the sources differ from their commit
@@ -91,7 +93,7 @@ def time_interleaved(
             rounds after the third if it is far beyond its time.
         rounds: how often each contender has its turn.
         device: whose time counts. On a GPU it is that between two events of the current stream, before and after the
-            call, so that the host's work counts where the GPU waits for it.
+            call; the host's work counts where it takes longer than a millisecond and the GPU waits for it.
     """
     blocks: dict[str, list[_Block]] = {name: [] for name in contenders}
     spent_s = dict.fromkeys(contenders, 0.0)
@@ -166,6 +168,7 @@ def _time_gpu_block(run: Callable[[], object], min_time_s: float, device: torch.
     def timed_call() -> tuple[torch.cuda.Event, torch.cuda.Event]:
         prepared = () if before is None else (before(),)
         cache.zero_()
+        torch.cuda._sleep(GPU_HEAD_START_CYCLES)
         start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
         start.record()
         call(*prepared)

@@ -38,6 +38,9 @@ KERNEL_ERROR = (ValueError, RuntimeError)
 def pytest_configure(config: pytest.Config) -> None:
     if SANITIZED and not _native.native_status()["build"].get("sanitizers"):
         raise pytest.UsageError(f"{_native.native_status()['path']} was not built with sanitizers")
+    if DEVICE != "cpu" and not (torch.cuda.is_available() and _native.native_status()["cuda"]):
+        why = _native.native_status()["cuda_reason"] or "torch sees no CUDA device"
+        raise pytest.UsageError(f"PRED_TEST_DEVICE={DEVICE}, but no CUDA kernel can run: {why}")
 
 
 def _redirect() -> torch.library.Library:

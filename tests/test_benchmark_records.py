@@ -99,6 +99,7 @@ def test_time_on_a_gpu_is_that_between_two_events(monkeypatch: pytest.MonkeyPatc
         return []
 
     monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(torch.cuda, "_sleep", lambda cycles: None)
     monkeypatch.setattr(torch.cuda, "synchronize", lambda device: order.append("synchronize"))
     timing = time_interleaved({"a": Run(call, before)}, 1, 0.06, rounds=3, device=torch.device("meta"))["a"]
     one = ["before", "event", "call 7", "event"]

@@ -1,6 +1,6 @@
 # Copyright 2026 The PRED authors
 # SPDX-License-Identifier: Apache-2.0
-"""CUDA kernels that run on the CPU (`make emulate`): what the tests of the ops do not ask of them."""
+"""CUDA kernels on a GPU (`make test-cuda`) or run by the CPU (`make emulate`): what no test of an op asks of them."""
 
 from __future__ import annotations
 
@@ -10,22 +10,24 @@ from torch import Tensor
 
 from pred import _native, ops
 from pred.ops.decode_field import project_bev
-from tests.conftest import EMULATED, KERNEL_ERROR
-from tests.ops.examples import EXAMPLES, Example, evaluate, order_of
+from tests.conftest import EMULATED, KERNEL_ERROR, LAUNCHED
+from tests.ops.examples import EXAMPLES, Example, Source, Wide, evaluate, order_of
 from tests.tolerances import FORWARD, GRADIENT, assert_close, relative_error
 
-pytestmark = pytest.mark.skipif(not EMULATED, reason="the CUDA kernels are not emulated here: make emulate")
+pytestmark = pytest.mark.skipif(not LAUNCHED, reason="no CUDA kernels are run here: make emulate")
+emulated = pytest.mark.skipif(not EMULATED, reason="the CUDA kernels are not emulated here: make emulate")
 
 ORDERS = ("forward", "backward", "shuffled")
 
 
+@emulated
 @pytest.mark.parametrize("example", EXAMPLES, ids=str)
 def test_no_result_depends_on_the_order_of_threads(
     native: None, deterministic: None, example: Example, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where a barrier is missing, one of the orders reads what is not yet written."""
-    for count in (3, 140):
-        arguments = example.example(count, torch.float32, seed=count)
+    for source in (Source(3, 3), Source(140, 140), Wide(30, 30)):
+        arguments = example.arguments(source, torch.float32)
         found = []
         for order in ORDERS:
             monkeypatch.setenv("PRED_EMULATION_ORDER", order)
@@ -89,6 +91,15 @@ def test_tf32_where_torch_allows_it(native: None, request: pytest.FixtureRequest
     assert project_bev(bev, weight)[0, :, 2, 5].isnan().all()
 
 
+def test_atomics_of_samples_that_touch_nothing(native: None) -> None:
+    """A whole run of them, at the end of the tensors. The sanitizer is the judge."""
+    bev, grid = torch.ones(1, 3, 4, 4), torch.full((1, 16, 2), -3.0)
+    grad = torch.ones(1, 16, 3)
+    grad_bev, _ = torch.ops.pred.sample_bev_backward(grad, bev, grid, False, False, True, False, False)
+    assert not grad_bev.any()
+
+
+@emulated
 def test_unknown_order_is_refused(native: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PRED_EMULATION_ORDER", "sideways")
     with pytest.raises(KERNEL_ERROR, match="PRED_EMULATION_ORDER must be forward, backward or shuffled, got sideways"):

@@ -46,16 +46,29 @@ struct Opacity {
   double passed;  // what is left of the light
 };
 
+constexpr int kLoads = 8;
+
 // values[c] = sum_i weights[i] values[i, c], of one ray.
 template <typename S, typename T>
 PRED_DEVICE_ONLY void render_channels(const T* weights, const S* values, int64_t count, int64_t channels, S* rendered) {
   for (int64_t first = 0; first < channels; first += kWarp) {
     const Columns lane(channels, first);
     T sum = T(0);
-    if (lane.there) {
-      const S* value = values + first + lane.column;
-#pragma unroll 4
-      for (int64_t i = lane.row; i < count; i += lane.rows) sum += weights[i] * widen(value[i * channels]);
+    const S* value = values + first + lane.column;
+    // As many loads at a time, or each would wait for the sum before it.
+    for (int64_t begin = lane.row; begin - lane.row < count; begin += kLoads * lane.rows) {
+      T weight[kLoads], here[kLoads];
+#pragma unroll
+      for (int k = 0; k < kLoads; ++k) {
+        const int64_t i = begin + k * lane.rows;
+        const bool there = lane.there && i < count;
+        weight[k] = there ? weights[i] : T(0);
+        here[k] = there ? widen(value[i * channels]) : T(0);
+      }
+#pragma unroll
+      for (int k = 0; k < kLoads; ++k) {
+        if (lane.there && begin + k * lane.rows < count) sum += weight[k] * here[k];
+      }
     }
     for (int distance = lane.group; distance < kWarp; distance *= 2) {
       sum += __shfl_xor_sync(kWholeWarp, sum, distance);
@@ -113,13 +126,22 @@ PRED_DEVICE_ONLY T channel_gradients(const CompositeArgs<S>& a, const CompositeC
   for (int64_t first = 0; first < channels; first += kWarp) {
     const Columns lane(channels, first);
     const T of_channel = lane.there ? widen(grad.values[ray * channels + first + lane.column]) : T(0);
-#pragma unroll 4
-    for (int i = lane.row; i < kWarp; i += lane.rows) {  // as often in each lane
-      const T weight_here = broadcast(weight, i);
-      if (i >= count || !lane.there) continue;
-      const int64_t element = (at + i) * channels + first + lane.column;
-      if (kDot) tile[i][lane.column] = widen(a.values[element]) * of_channel;
-      if (kOuter) out.values[element] = narrow<S>(weight_here * of_channel);
+    const int64_t from = at * channels + first + lane.column;
+    for (int begin = lane.row; begin < kWarp; begin += kLoads * lane.rows) {  // as often in each lane
+      T value[kLoads];
+#pragma unroll
+      for (int k = 0; k < kLoads; ++k) {  // ahead of the stores
+        const int i = begin + k * lane.rows;
+        value[k] = kDot && i < count && lane.there ? widen(a.values[from + i * channels]) : T(0);
+      }
+#pragma unroll
+      for (int k = 0; k < kLoads; ++k) {
+        const int i = begin + k * lane.rows;
+        const T weight_here = broadcast(weight, i % kWarp);
+        if (i >= count || !lane.there) continue;
+        if (kDot) tile[i][lane.column] = value[k] * of_channel;
+        if (kOuter) out.values[from + i * channels] = narrow<S>(weight_here * of_channel);
+      }
     }
     if (!kDot) continue;
     __syncwarp();

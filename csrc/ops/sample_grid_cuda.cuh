@@ -398,7 +398,9 @@ __global__ void __launch_bounds__(kThreads)
             if (row[k]) add_pack<V>(row[k] + c, sum[k]);
             for (int v = 0; v < V; ++v) sum[k][v] = 0;
           }
-          if (sample == last) break;
+        }
+        if (sample == last) break;
+        if (key != held) {
           held = key;
           const Corners<S, Axes> p(grad_map + map * a.stride[Axes], a, stencil(a, sample));
 #pragma unroll

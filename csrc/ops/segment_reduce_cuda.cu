@@ -47,7 +47,7 @@ __global__ void forward_kernel(SegmentReduceArgs<S> a, const uint64_t* sorted, c
   using T = Compute<S>;
   const uint64_t row_mask = (uint64_t(1) << row_bits) - 1;
   for (int64_t i = first_thread(); i < num_segments * a.channels; i += thread_stride()) {
-    const int64_t segment = i / a.channels, c = i - segment * a.channels, first = start[segment];
+    const int64_t segment = divide(i, a.channels), c = i - segment * a.channels, first = start[segment];
     const int64_t last = start[segment + 1];
     T result = T(0);
     int32_t winner = -1;
@@ -76,7 +76,7 @@ template <typename S, SegmentReduction kReduction>
 __global__ void backward_kernel(const S* grad, int64_t num_segments, int64_t channels, const int64_t* index,
                                 const int32_t* saved, S* out, int64_t num_rows) {
   for (int64_t i = first_thread(); i < num_rows * channels; i += thread_stride()) {
-    const int64_t row = i / channels, c = i - row * channels, segment = index[row];
+    const int64_t row = divide(i, channels), c = i - row * channels, segment = index[row];
     S value{};
     if (segment >= 0 && segment < num_segments) {
       const int64_t from = segment * channels + c;

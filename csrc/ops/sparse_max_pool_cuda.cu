@@ -13,7 +13,7 @@ template <typename S>
 __global__ void forward_kernel(const S* features, int64_t source_rows, int64_t channels, const int32_t* table,
                                int64_t taps, S* out, int32_t* winner, int64_t rows) {
   for (int64_t i = first_thread(); i < rows * channels; i += thread_stride()) {
-    const int64_t row = i / channels, c = i - row * channels;
+    const int64_t row = divide(i, channels), c = i - row * channels;
     S best{};
     int32_t from = -1;
     for (int64_t tap = 0; tap < taps; ++tap) {
@@ -34,7 +34,7 @@ __global__ void backward_kernel(const S* grad, const int32_t* winner, int64_t so
                                 const int32_t* table, int64_t taps, S* out, int64_t rows) {
   using T = Compute<S>;
   for (int64_t i = first_thread(); i < rows * channels; i += thread_stride()) {
-    const int64_t row = i / channels, c = i - row * channels;
+    const int64_t row = divide(i, channels), c = i - row * channels;
     T sum = T(0);
     for (int64_t tap = 0; tap < taps; ++tap) {
       const int64_t output = table[row * taps + tap];

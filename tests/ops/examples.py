@@ -71,6 +71,13 @@ class Source:
         return self.integers(round(parts * low), round(parts * high) + 1, *shape).double() / parts
 
 
+class Wide(Source):
+    """Rows of 40 or 64 where there may be so many: accesses of 16 bytes, and more than one turn of a warp."""
+
+    def size(self, default: int, low: int, high: int) -> int:
+        return 64 if high >= 64 else 40 if high >= 40 else default
+
+
 @dataclass(frozen=True)
 class Example:
     """One way to call one op."""

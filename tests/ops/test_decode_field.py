@@ -225,7 +225,7 @@ def test_bitwise_equal_for_any_thread_count(deterministic: None, precision: str,
         assert torch.equal(value, found[1][name]) and torch.equal(value, found[2][name]), name
 
 
-def test_gradcheck_of_all_outputs_together(native: None) -> None:
+def test_gradcheck_of_all_outputs_together(native: None, deterministic: None) -> None:
     case = make(hidden=16, layers=3, classes=2, channels=2, frequencies=2, beta=3.0, count=4)
 
     def call(bev: Tensor, points: Tensor, *layers: Tensor) -> tuple[Tensor, ...]:
