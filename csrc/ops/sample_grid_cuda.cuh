@@ -36,30 +36,54 @@ PRED_DEVICE_ONLY const S* gradient_row(const SampleGridArgs<S, Axes>& a, int64_t
   return a.grad_slopes + (sample * Axes + m - 1) * a.channels;
 }
 
+// A warp has 32 neighbouring samples: each lane finds the corners and weights of one, which the groups then take in
+// turn.
 template <int kOuts, int V, typename S, int Axes>
 __global__ void __launch_bounds__(kThreads)
     forward_kernel(SampleGridArgs<S, Axes> a, S* out, S* slopes, int64_t num_samples, int lanes) {
   using T = Compute<S>;
+  constexpr int kCorners = 1 << Axes;
   const Group group(lanes);
-  for (int64_t sample = group.first(); sample < num_samples; sample += group.stride()) {
-    const auto s = stencil(a, sample);
-    T weight[kOuts][1 << Axes];
-    forward_weights<kOuts>(s, weight);
-    const Corners<S, Axes> p(a.map + divide(sample, a.num_samples) * a.stride[Axes], a, s);
-    for (int64_t c = group.lane * V; c < a.channels; c += group.size * V) {
-      T sum[kOuts][V] = {};
+  for (int64_t base = first_warp() * kWarp; base < num_samples; base += warp_stride() * kWarp) {
+    const int64_t own = base + lane_number();
+    T own_weight[kOuts][kCorners] = {};
+    int64_t own_offset = 0;
+    unsigned own_inside = 0;
+    if (own < num_samples) {
+      const auto s = stencil(a, own);
+      forward_weights<kOuts>(s, own_weight);
+      own_offset = divide(own, a.num_samples) * a.stride[Axes];
+      for (int axis = 0; axis < Axes; ++axis) own_offset += s.axis[axis].low * a.stride[axis];
 #pragma unroll
-      for (int k = 0; k < 1 << Axes; ++k) {
-        T value[V];
-        load_pack<V>(p.row[k] ? p.row[k] + c : nullptr, value);
+      for (int k = 0; k < kCorners; ++k) own_inside |= unsigned(linear_inside(s, k)) << k;
+    }
+    for (int turn = 0; turn < kWarp && base + turn < num_samples; turn += group.per_warp()) {
+      const int from = turn + group.number();
+      const int64_t sample = base + from, offset = broadcast(own_offset, from);
+      const unsigned inside = broadcast(own_inside, from);
+      T weight[kOuts][kCorners];
 #pragma unroll
-        for (int m = 0; m < kOuts; ++m) {
-          for (int v = 0; v < V; ++v) sum[m][v] += value[v] * weight[m][k];
-        }
+      for (int m = 0; m < kOuts; ++m) {
+        for (int k = 0; k < kCorners; ++k) weight[m][k] = broadcast(own_weight[m][k], from);
       }
-      store_pack<V>(out + sample * a.channels + c, sum[0]);
+      if (sample >= num_samples) continue;
+      for (int64_t c = group.lane * V; c < a.channels; c += group.size * V) {
+        T sum[kOuts][V] = {};
 #pragma unroll
-      for (int m = 1; m < kOuts; ++m) store_pack<V>(slopes + (sample * Axes + m - 1) * a.channels + c, sum[m]);
+        for (int k = 0; k < kCorners; ++k) {
+          int64_t at = offset + c;
+          for (int axis = 0; axis < Axes; ++axis) at += (k >> axis & 1) * a.stride[axis];
+          T value[V];
+          load_constant_pack<V>(inside >> k & 1 ? a.map + at : nullptr, value);
+#pragma unroll
+          for (int m = 0; m < kOuts; ++m) {
+            for (int v = 0; v < V; ++v) sum[m][v] += value[v] * weight[m][k];
+          }
+        }
+        store_pack<V>(out + sample * a.channels + c, sum[0]);
+#pragma unroll
+        for (int m = 1; m < kOuts; ++m) store_pack<V>(slopes + (sample * Axes + m - 1) * a.channels + c, sum[m]);
+      }
     }
   }
 }
@@ -428,8 +452,8 @@ template <typename S, int Axes>
 void forward(const SampleGridArgs<S, Axes>& a, S* out, S* slopes, int64_t, int64_t num_samples) {
   by_pack<S>(in_packs<S>(a.channels, a.map, out, slopes), a.channels, [&](auto pack, int lanes) {
     constexpr int V = decltype(pack)::value;
-    launch_threads(slopes ? forward_kernel<1 + Axes, V, S, Axes> : forward_kernel<1, V, S, Axes>, num_samples * lanes,
-                   a, out, slopes, num_samples, lanes);
+    launch_warps(slopes ? forward_kernel<1 + Axes, V, S, Axes> : forward_kernel<1, V, S, Axes>,
+                 (num_samples + kWarp - 1) / kWarp, a, out, slopes, num_samples, lanes);
   });
 }
 

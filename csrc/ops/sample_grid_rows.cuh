@@ -30,9 +30,15 @@ PRED_DEVICE_ONLY void load_pack(const S* from, Compute<S> (&value)[V]) {
 // The same of memory that the kernel does not write, so that loads may go ahead of stores.
 template <int V, typename S>
 PRED_DEVICE_ONLY void load_constant_pack(const S* from, Compute<S> (&value)[V]) {
-  Pack<S, V> pack;
+  Pack<S, V> pack{};
+  if (!from) {
+#pragma unroll
+    for (int v = 0; v < V; ++v) value[v] = Compute<S>(0);
+    return;
+  }
 #ifdef __CUDA_ARCH__
-  using Word = std::conditional_t<sizeof(pack) == 4, unsigned, std::conditional_t<sizeof(pack) == 8, uint2, uint4>>;
+  using Small = std::conditional_t<sizeof(pack) == 2, unsigned short, unsigned>;
+  using Word = std::conditional_t<sizeof(pack) <= 4, Small, std::conditional_t<sizeof(pack) == 8, uint2, uint4>>;
   static_assert(sizeof(Word) == sizeof(pack));
   const Word word = __ldg(reinterpret_cast<const Word*>(from));
   __builtin_memcpy(&pack, &word, sizeof word);
@@ -53,12 +59,15 @@ PRED_DEVICE_ONLY void store_pack(S* to, const Compute<S> (&value)[V]) {
 
 // Lanes that share one sample, a power of 2.
 struct Group {
-  int size, lane;
+  int size, shift, lane;
 
-  __device__ explicit Group(int lanes) : size(lanes), lane(lane_number() % lanes) {}
+  __device__ explicit Group(int lanes) : size(lanes), shift(__ffs(lanes) - 1), lane(lane_number() & (lanes - 1)) {}
   // Samples are numbered so that the groups of a warp have neighbouring ones.
-  __device__ int64_t first() const { return first_thread() / size; }
-  __device__ int64_t stride() const { return thread_stride() / size; }
+  __device__ int64_t first() const { return first_thread() >> shift; }
+  __device__ int64_t stride() const { return thread_stride() >> shift; }
+  // Among those of the warp, and how many there are.
+  __device__ int number() const { return lane_number() >> shift; }
+  __device__ int per_warp() const { return kWarp >> shift; }
 };
 
 // The rows of the map between which a sample lies; null outside of it.
