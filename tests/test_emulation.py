@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pred import _native, ops
 from pred.ops.decode_field import project_bev
-from tests.conftest import EMULATED, KERNEL_ERROR, LAUNCHED
+from tests.conftest import DEVICE, EMULATED, KERNEL_ERROR, LAUNCHED
 from tests.ops.examples import EXAMPLES, Example, Source, Wide, evaluate, order_of
 from tests.tolerances import FORWARD, GRADIENT, assert_close, relative_error
 
@@ -89,6 +89,39 @@ def test_tf32_where_torch_allows_it(native: None, request: pytest.FixtureRequest
     assert relative_error(precise[0], exact) < FORWARD[torch.float32]
     bev[0, 3, 2, 5] = torch.nan
     assert project_bev(bev, weight)[0, :, 2, 5].isnan().all()
+
+
+def shifted(tensor: Tensor) -> Tensor:
+    """Where no access of 16 bytes can begin."""
+    return torch.empty(tensor.numel() + 1, dtype=tensor.dtype, device=DEVICE)[1:].view(tensor.shape).copy_(tensor)
+
+
+def test_tensors_that_begin_anywhere(native: None, deterministic: None) -> None:
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=generator)
+
+    rows, grid, grad, weight = normal(1, 7, 6, 8), normal(1, 30, 2) / 2, normal(1, 30, 8), normal(12, 8)
+    sdf, t, values = normal(5, 40), normal(5, 40).abs().cumsum(1), normal(5, 40, 8)
+    points, features = normal(50, 5), normal(42, 8)
+    table = torch.arange(42, dtype=torch.int32, device=DEVICE)[:, None]
+    found = []
+    for place in (lambda tensor: tensor.to(DEVICE), shifted):
+        bev = place(rows).permute(0, 3, 1, 2).requires_grad_()
+        out = ops.sample_bev(bev, place(grid))
+        rays = ops.composite_rays(place(sdf), 2.0, place(t), place(values))
+        voxels = ops.voxelize(
+            place(points)[:, :3], torch.tensor([0, 50], device=DEVICE), [0.5] * 3, [-2.0] * 3 + [2.0] * 3
+        )
+        results = [out, *torch.autograd.grad(out, bev, place(grad)), rays.weights, rays.depth, rays.values, *voxels]
+        results += [
+            project_bev(bev, place(weight)),
+            ops.sparse_conv(place(features), place(weight)[:, None], table, table),
+        ]
+        found.append(results)
+    for here, there in zip(*found, strict=True):
+        assert here is not None and there is not None and torch.equal(here, there)
 
 
 def test_atomics_of_samples_that_touch_nothing(native: None) -> None:
