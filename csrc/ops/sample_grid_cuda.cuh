@@ -392,11 +392,12 @@ PRED_DEVICE_ONLY void add_pack(T* to, const T (&value)[V]) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
   if constexpr (std::is_same_v<T, float> && V == 4) {
     atomicAdd(reinterpret_cast<float4*>(to), make_float4(value[0], value[1], value[2], value[3]));
-    return;
-  }
+  } else
 #endif
+  {
 #pragma unroll
-  for (int v = 0; v < V; ++v) atomicAdd(to + v, value[v]);
+    for (int v = 0; v < V; ++v) atomicAdd(to + v, value[v]);
+  }
 }
 
 template <int kRows, int V, typename S, int Axes>

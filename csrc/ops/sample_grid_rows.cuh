@@ -61,7 +61,12 @@ PRED_DEVICE_ONLY void store_pack(S* to, const Compute<S> (&value)[V]) {
 struct Group {
   int size, shift, lane;
 
-  __device__ explicit Group(int lanes) : size(lanes), shift(__ffs(lanes) - 1), lane(lane_number() & (lanes - 1)) {}
+  // In the body: the host's compiler sees initializers of device constructors, but knows no intrinsics.
+  __device__ explicit Group(int lanes) {
+    size = lanes;
+    shift = __ffs(lanes) - 1;
+    lane = lane_number() & (lanes - 1);
+  }
   // Samples are numbered so that the groups of a warp have neighbouring ones.
   __device__ int64_t first() const { return first_thread() >> shift; }
   __device__ int64_t stride() const { return thread_stride() >> shift; }
