@@ -80,12 +80,36 @@ PRED_HOST_DEVICE U narrow_float16(F value) {
 PRED_HOST_DEVICE float widen(float value) { return value; }
 PRED_HOST_DEVICE double widen(double value) { return value; }
 PRED_HOST_DEVICE float widen(BFloat16 value) { return widen_bfloat16<float>(uint32_t(value.bits)); }
-PRED_HOST_DEVICE float widen(Float16 value) { return widen_float16<float>(uint32_t(value.bits)); }
+PRED_HOST_DEVICE float widen(Float16 value) {
+#ifdef __CUDA_ARCH__
+  float wide;
+  asm("cvt.f32.f16 %0, %1;" : "=f"(wide) : "h"(value.bits));
+  return wide;
+#else
+  return widen_float16<float>(uint32_t(value.bits));
+#endif
+}
 
 PRED_HOST_DEVICE void narrow_to(float& to, float value) { to = value; }
 PRED_HOST_DEVICE void narrow_to(double& to, double value) { to = value; }
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+// Both rounded, `low` in the lower bits: what the instructions take at full rate is a pair.
+__device__ inline uint32_t narrow_pair(BFloat16, float low, float high) {
+  uint32_t both;
+  asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(both) : "f"(high), "f"(low));
+  return both;
+}
+__device__ inline uint32_t narrow_pair(Float16, float low, float high) {
+  uint32_t both;
+  asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(both) : "f"(high), "f"(low));
+  return both;
+}
+PRED_HOST_DEVICE void narrow_to(BFloat16& to, float value) { to.bits = uint16_t(narrow_pair(BFloat16{}, value, 0)); }
+PRED_HOST_DEVICE void narrow_to(Float16& to, float value) { to.bits = uint16_t(narrow_pair(Float16{}, value, 0)); }
+#else
 PRED_HOST_DEVICE void narrow_to(BFloat16& to, float value) { to.bits = uint16_t(narrow_bfloat16<uint32_t>(value)); }
 PRED_HOST_DEVICE void narrow_to(Float16& to, float value) { to.bits = uint16_t(narrow_float16<uint32_t>(value)); }
+#endif
 
 // To storage, rounded to nearest even: narrow<BFloat16>(x). NaN stays NaN.
 template <typename Storage>

@@ -1,7 +1,7 @@
 // Copyright 2026 The PRED authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Matrix products with epilogues on the accumulators, on tensor cores: bfloat16, and float32 as three products of its
+// Matrix products with epilogues on the accumulators, on tensor cores: halves, and float32 as three products of its
 // parts in TF32, which together have the accuracy of float32; or as one product of rounded factors, where TF32 is
 // asked for. float64, and what a device has no tensor cores for, is multiplied and added one by one.
 //
@@ -11,12 +11,7 @@
 
 #include <type_traits>
 
-#include "common/launch.cuh"
-#include "math/half.h"
-
-#ifdef __CUDACC__
-#include <cuda_pipeline.h>
-#endif
+#include "common/pack.cuh"
 
 namespace pred::PRED_ISA {
 namespace {
@@ -57,7 +52,7 @@ struct alignas(16) SharedTile {
 
 // --- Tensor cores --------------------------------------------------------------------------------
 // mma_...: d += a b for one piece, in the layout of the instructions: lane 4 g + t has d of rows g and g + 8, columns
-// 2 t and 2 t + 1. They round sums toward zero.
+// 2 t and 2 t + 1; the first of them d = a b. They round sums toward zero.
 // load_matrices: four matrices of 8 x 8 pairs of bytes in shared memory, of which lane 8 i + r names row r of matrix i
 // (16 bytes, aligned). Lane 4 g + t gets elements 2 t and 2 t + 1 of row g of each, or of column g of its transpose.
 #if !defined(__CUDACC__)
@@ -91,13 +86,16 @@ inline void emulate_mma(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint
     d[i] = round_toward_zero(sum);
   }
 }
-inline void mma_bfloat16(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
+template <typename S>
+inline void mma_half(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
   emulate_mma<16>(d, a, b0, b1, [](uint32_t x, uint32_t y) {
-    return double(widen_bfloat16<float>(x & 0xffffu)) * double(widen_bfloat16<float>(y & 0xffffu)) +
-           double(bits_as<float>(x & 0xffff0000u)) * double(bits_as<float>(y & 0xffff0000u));
+    return double(widen(S{uint16_t(x)})) * double(widen(S{uint16_t(y)})) +
+           double(widen(S{uint16_t(x >> 16)})) * double(widen(S{uint16_t(y >> 16)}));
   });
 }
+template <bool kFirst>
 inline void mma_tf32(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
+  for (int i = 0; i < 4 && kFirst; ++i) d[i] = 0;
   emulate_mma<8>(d, a, b0, b1, [](uint32_t x, uint32_t y) {
     return double(bits_as<float>(x & 0xffffe000u)) * double(bits_as<float>(y & 0xffffe000u));
   });
@@ -117,15 +115,29 @@ inline void load_matrices(const void* row, uint32_t (&to)[4]) {
 #elif !defined(__CUDA_ARCH__) || __CUDA_ARCH__ >= 800
 constexpr bool kTensorCores = true;
 
-PRED_DEVICE_ONLY void mma_bfloat16(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
-  asm("mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
-      : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
-      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+template <typename S>
+PRED_DEVICE_ONLY void mma_half(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
+  if constexpr (std::is_same_v<S, BFloat16>) {
+    asm("mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+        : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
+        : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+  } else {
+    asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+        : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
+        : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+  }
 }
+template <bool kFirst>
 PRED_DEVICE_ONLY void mma_tf32(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
-  asm("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
-      : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
-      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+  if constexpr (kFirst) {
+    asm("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%10,%10,%10,%10};"
+        : "=f"(d[0]), "=f"(d[1]), "=f"(d[2]), "=f"(d[3])
+        : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1), "f"(0.0f));
+  } else {
+    asm("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+        : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
+        : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+  }
 }
 template <bool kTranspose>
 PRED_DEVICE_ONLY void load_matrices(const void* row, uint32_t (&to)[4]) {
@@ -144,7 +156,9 @@ PRED_DEVICE_ONLY void load_matrices(const void* row, uint32_t (&to)[4]) {
 }
 #else
 constexpr bool kTensorCores = false;
-PRED_DEVICE_ONLY void mma_bfloat16(float (&)[4], const uint32_t (&)[4], uint32_t, uint32_t) {}
+template <typename S>
+PRED_DEVICE_ONLY void mma_half(float (&)[4], const uint32_t (&)[4], uint32_t, uint32_t) {}
+template <bool kFirst>
 PRED_DEVICE_ONLY void mma_tf32(float (&)[4], const uint32_t (&)[4], uint32_t, uint32_t) {}
 template <bool kTranspose>
 PRED_DEVICE_ONLY void load_matrices(const void*, uint32_t (&)[4]) {}
@@ -156,7 +170,7 @@ PRED_DEVICE_ONLY void load_left(const SharedTile<S, kOuter>& tile, int row, int 
   const int lane = lane_number();
   if constexpr (!kOuter) {
     load_matrices<false>(&tile.x[row + lane % 16][k + lane / 16 * kChunk<S>], a);
-  } else if constexpr (std::is_same_v<S, BFloat16>) {
+  } else if constexpr (sizeof(S) == 2) {
     load_matrices<true>(&tile.x[k + lane % 8 + lane / 16 * 8][row + lane / 8 % 2 * 8], a);
   } else {
     for (int i = 0; i < 4; ++i) a[i] = bits_as<uint32_t>(tile.x[k + lane % 4 + i / 2 * 4][row + lane / 4 + i % 2 * 8]);
@@ -169,7 +183,7 @@ PRED_DEVICE_ONLY void load_right(const SharedTile<S, kOuter>& tile, int column, 
   const int lane = lane_number();
   if constexpr (!kOuter) {
     load_matrices<false>(&tile.x[column + lane % 8 + lane / 16 * 8][k + lane / 8 % 2 * kChunk<S>], b);
-  } else if constexpr (std::is_same_v<S, BFloat16>) {
+  } else if constexpr (sizeof(S) == 2) {
     load_matrices<true>(&tile.x[k + lane % 16][column + lane / 16 * 8], b);
   } else {
     for (int i = 0; i < 4; ++i)
@@ -177,22 +191,27 @@ PRED_DEVICE_ONLY void load_right(const SharedTile<S, kOuter>& tile, int column, 
   }
 }
 
-// Numbers of 24 bits as sums of two, of which the instructions read 11 bits each. The rest of infinity is NaN.
+// Numbers of 24 bits rounded to 11, which the instructions read, and with what is left of them: NaN where they are not
+// finite, whatever the other part becomes.
+PRED_DEVICE_ONLY void round_tf32(uint32_t (&x)[4]) {
+#pragma unroll
+  for (int i = 0; i < 4; ++i) x[i] = bits_as<float>(x[i]) == bits_as<float>(x[i]) ? x[i] + 0x1000u : x[i];
+}
 PRED_DEVICE_ONLY void split_tf32(uint32_t (&x)[4], uint32_t (&rest)[4]) {
 #pragma unroll
   for (int i = 0; i < 4; ++i) {
-    const float value = bits_as<float>(x[i]);
-    const uint32_t nearest = value == value ? (x[i] + 0x1000u) & 0xffffe000u : x[i];
-    rest[i] = bits_as<uint32_t>(value - bits_as<float>(nearest));
+    const uint32_t nearest = (x[i] + 0x1000u) & 0xffffe000u;
+    rest[i] = bits_as<uint32_t>(bits_as<float>(x[i]) - bits_as<float>(nearest));
     x[i] = nearest;
   }
 }
 
-// One stage: sum += rows [row0, row0 + kWarpM) of `left` times rows [column0, column0 + kWarpN) of `right`.
-template <typename S, bool kOuter, typename T = Compute<S>>
+// One stage: sum += rows [row0, row0 + kWarpM) of `left` times rows [column0, column0 + kWarpN) of `right`; with
+// factors of type float rounded, or exact.
+template <bool kRounded, typename S, bool kOuter, typename T = Compute<S>>
 PRED_DEVICE_ONLY void multiply_stage(const SharedTile<S, kOuter>& left, const SharedTile<S, kOuter>& right, int row0,
-                                     int column0, bool tf32, T (&sum)[kPiecesM][kPiecesN][4]) {
-  static_assert(std::is_same_v<S, BFloat16> || std::is_same_v<S, float> || std::is_same_v<S, double>);
+                                     int column0, T (&sum)[kPiecesM][kPiecesN][4]) {
+  constexpr bool kSplit = std::is_same_v<S, float> && !kRounded;
   if constexpr (kTensorCores && !std::is_same_v<S, double>) {
 #pragma unroll
     for (int k = 0; k < kTileK<S>; k += 2 * kChunk<S>) {
@@ -200,31 +219,39 @@ PRED_DEVICE_ONLY void multiply_stage(const SharedTile<S, kOuter>& left, const Sh
 #pragma unroll
       for (int j = 0; j < kPiecesN / 2; ++j) {
         load_right(right, column0 + 16 * j, k, b[j]);
-        if constexpr (std::is_same_v<S, float>) split_tf32(b[j], b_rest[j]);
+        if constexpr (kSplit) {
+          split_tf32(b[j], b_rest[j]);
+        } else if constexpr (std::is_same_v<S, float>) {
+          round_tf32(b[j]);
+        }
       }
 #pragma unroll
       for (int i = 0; i < kPiecesM; ++i) {
         uint32_t a[4], a_rest[4];
         load_left(left, row0 + 16 * i, k, a);
-        if constexpr (std::is_same_v<S, float>) split_tf32(a, a_rest);
+        if constexpr (kSplit) {
+          split_tf32(a, a_rest);
+        } else if constexpr (std::is_same_v<S, float>) {
+          round_tf32(a);
+        }
 #pragma unroll
         for (int pair = 0; pair < kPiecesN / 2; ++pair) {
           if constexpr (std::is_same_v<S, float>) {
             // From 0, and added up by ordinary sums: what the instructions round off stays a part of eight products.
-            float part[2][4] = {};
-            if (!tf32) {
+            float part[2][4];
+            if constexpr (kSplit) {
 #pragma unroll
-              for (int j = 0; j < 2; ++j) mma_tf32(part[j], a_rest, b[pair][2 * j], b[pair][2 * j + 1]);
+              for (int j = 0; j < 2; ++j) mma_tf32<true>(part[j], a_rest, b[pair][2 * j], b[pair][2 * j + 1]);
 #pragma unroll
-              for (int j = 0; j < 2; ++j) mma_tf32(part[j], a, b_rest[pair][2 * j], b_rest[pair][2 * j + 1]);
+              for (int j = 0; j < 2; ++j) mma_tf32<false>(part[j], a, b_rest[pair][2 * j], b_rest[pair][2 * j + 1]);
             }
 #pragma unroll
-            for (int j = 0; j < 2; ++j) mma_tf32(part[j], a, b[pair][2 * j], b[pair][2 * j + 1]);
+            for (int j = 0; j < 2; ++j) mma_tf32<!kSplit>(part[j], a, b[pair][2 * j], b[pair][2 * j + 1]);
 #pragma unroll
             for (int e = 0; e < 8; ++e) sum[i][2 * pair + e / 4][e % 4] += part[e / 4][e % 4];
           } else {
 #pragma unroll
-            for (int j = 0; j < 2; ++j) mma_bfloat16(sum[i][2 * pair + j], a, b[pair][2 * j], b[pair][2 * j + 1]);
+            for (int j = 0; j < 2; ++j) mma_half<S>(sum[i][2 * pair + j], a, b[pair][2 * j], b[pair][2 * j + 1]);
           }
         }
       }
@@ -253,33 +280,31 @@ PRED_DEVICE_ONLY void multiply_stage(const SharedTile<S, kOuter>& left, const Sh
 }
 
 // --- Blocks --------------------------------------------------------------------------------------
-// 16 bytes to shared memory, or zeros; in its own time, until wait_for_copies.
-PRED_DEVICE_ONLY void copy_chunk(void* to, const void* from) {
-#ifdef __CUDACC__
-  if (from) {
-    __pipeline_memcpy_async(to, from, 16);
-  } else {
-    *static_cast<uint4*>(to) = uint4{0, 0, 0, 0};
-  }
+// The 16 bytes from row[column] on to shared memory, or zeros where nothing is there; in its own time, until
+// wait_for_copies.
+template <typename S>
+PRED_DEVICE_ONLY void copy_chunk(S* to, const S* row, int64_t column, bool there) {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+  asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" ::"r"(uint32_t(__cvta_generic_to_shared(to))),
+               "l"(reinterpret_cast<uintptr_t>(row) + column * sizeof(S)), "r"(there ? 16 : 0)
+               : "memory");
 #else
-  if (from)
-    memcpy(to, from, 16);
-  else
-    memset(to, 0, 16);
+  using Chunk = Pack<S, kChunk<S>>;
+  *reinterpret_cast<Chunk*>(to) = there ? *reinterpret_cast<const Chunk*>(row + column) : Chunk{};
 #endif
 }
 
 PRED_DEVICE_ONLY void commit_copies() {
-#ifdef __CUDACC__
-  __pipeline_commit();
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+  asm volatile("cp.async.commit_group;" ::: "memory");
 #endif
 }
 
 // All but the last `later` commits.
 template <int later>
 PRED_DEVICE_ONLY void wait_for_copies() {
-#ifdef __CUDACC__
-  __pipeline_wait_prior(later);
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+  asm volatile("cp.async.wait_group %0;" ::"n"(later) : "memory");
 #endif
 }
 
@@ -295,10 +320,21 @@ struct ProductSizes {
 
 constexpr int kMostSparseSegments = 512;
 
+// Columns of results that a lane has side by side. In an inner product the rows of `right` lie in shared memory in an
+// order that gives each lane kColumns of its warp's kWarpN.
+template <bool kOuter>
+constexpr int kColumns = kOuter ? 2 : 2 * kPiecesN;
+
+// Of the shared row i of `right`, the row among those of the tile: of each piece, two columns belong to a lane.
+PRED_DEVICE_ONLY int right_row(int i) {
+  const int piece = i / 8 % kPiecesN, lane = i / 2 % 4;
+  return i / kWarpN * kWarpN + lane * kColumns<false> + 2 * piece + i % 2;
+}
+
 // Left and Right: const S* row(int64_t i, int segment), null for a row of zeros. Left::kSparse: most rows are, and
-// segments for which all rows of a tile are, are left out, up to kMostSparseSegments of an inner product. The epilogue
-// gets (row, column, split, value, value of the next column), for rows below m and columns below n, from one thread
-// each.
+// segments for which all rows of a tile are, are left out, up to kMostSparseSegments of an inner product.
+// Epilogue: at(column, split) gives what takes (row, values) of kColumns columns, of which those below n count. A
+// thread asks once for all its rows.
 template <typename S, bool kOuter, class Left, class Right, class Epilogue>
 __global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1 : 2)
     product_kernel(ProductSizes sizes, Left left, Right right, Epilogue epilogue) {
@@ -315,8 +351,9 @@ __global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1
     const int part = int(task / (tiles_m * tiles_n)), split = part % sizes.splits;
     const int64_t tile = task % (tiles_m * tiles_n), first_m = tile / tiles_n * kTileM,
                   first_n = tile % tiles_n * kTileN;
+    const int64_t first[2] = {first_m, first_n}, size[2] = {sizes.m, sizes.n};  // of `left` and of `right`
     const int64_t steps_all = (sizes.k + kTileK<S> - 1) / kTileK<S>;
-    const int64_t step0 = steps_all * split / sizes.splits, step1 = steps_all * (split + 1) / sizes.splits;
+    const int step0 = int(steps_all * split / sizes.splits), step1 = int(steps_all * (split + 1) / sizes.splits);
     if (by_list) {
       for (int segment = warp; segment < sizes.segments; segment += kProductThreads / kWarp) {
         bool any = false;
@@ -333,24 +370,38 @@ __global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1
       }
       __syncthreads();
     }
-    const int64_t steps = (step1 - step0) * (sizes.apart ? 1 : by_list ? num_used : sizes.segments);
-    int place = sizes.apart ? part / sizes.splits : 0,
-        to_fill = 0;  // of the next stage that is fetched: among the segments, and in `tiles`
-    int64_t next_step = step0;
-    const auto fetch = [&] {
+    const int steps = (step1 - step0) * (sizes.apart ? 1 : by_list ? num_used : sizes.segments);
+    // The next stage that is fetched: its place among the segments, and in `tiles`.
+    int place = sizes.apart ? part / sizes.splits : 0, to_fill = 0;
+    int next_step = step0;
+    // The rows of this thread's chunks: in an inner product the same in all stages of a segment.
+    constexpr int kCopies = Tile::kChunks / kProductThreads;
+    static_assert(Tile::kChunks % kProductThreads == 0);
+    const S* rows[2][kCopies];
+    const auto find_rows = [&] {
       const int segment = by_list ? used[place] : place;
-      const int64_t k0 = next_step * kTileK<S>;
 #pragma unroll
       for (int factor = 0; factor < 2; ++factor) {
-        Tile& to = tiles[to_fill][factor];
-        const int64_t first = factor ? first_n : first_m, size = factor ? sizes.n : sizes.m;
 #pragma unroll
-        for (int chunk = int(threadIdx.x); chunk < Tile::kChunks; chunk += kProductThreads) {
+        for (int copy = 0; copy < kCopies; ++copy) {
+          const int i = (int(threadIdx.x) + copy * kProductThreads) / Tile::kChunksPerRow;
+          const int64_t row = kOuter ? int64_t(next_step) * kTileK<S> + i : first[factor] + (factor ? right_row(i) : i);
+          const bool there = row < (kOuter ? sizes.k : size[factor]);
+          rows[factor][copy] = !there ? nullptr : factor ? right.row(row, segment) : left.row(row, segment);
+        }
+      }
+    };
+    const auto fetch = [&] {
+      if (kOuter || (Left::kSparse && next_step == step0)) find_rows();
+#pragma unroll
+      for (int factor = 0; factor < 2; ++factor) {
+#pragma unroll
+        for (int copy = 0; copy < kCopies; ++copy) {
+          const int chunk = int(threadIdx.x) + copy * kProductThreads;
           const int i = chunk / Tile::kChunksPerRow, c = chunk % Tile::kChunksPerRow * kChunk<S>;
-          const int64_t row = kOuter ? k0 + i : first + i, column = kOuter ? first + c : k0 + c;
-          const bool there = row < (kOuter ? sizes.k : size) && column < (kOuter ? size : sizes.k);
-          const S* from = !there ? nullptr : factor ? right.row(row, segment) : left.row(row, segment);
-          copy_chunk(&to.x[i][c], from ? from + column : nullptr);
+          const int64_t column = (kOuter ? first[factor] : int64_t(next_step) * kTileK<S>)+c;
+          const S* const row = rows[factor][copy];
+          copy_chunk(&tiles[to_fill][factor].x[i][c], row, column, row && column < (kOuter ? size[factor] : sizes.k));
         }
       }
       to_fill = to_fill + 1 < kStages ? to_fill + 1 : 0;
@@ -359,6 +410,7 @@ __global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1
         ++place;
       }
     };
+    if (!kOuter && !Left::kSparse) find_rows();
     T sum[kPiecesM][kPiecesN][4] = {};
 #pragma unroll
     for (int stage = 0; stage < kStages - 1; ++stage) {
@@ -366,24 +418,36 @@ __global__ void __launch_bounds__(kProductThreads, std::is_same_v<S, double> ? 1
       commit_copies();  // of nothing, too: the waiting below counts commits
     }
     int stage = 0;
-    for (int64_t step = 0; step < steps; ++step) {
+    for (int step = 0; step < steps; ++step) {
       wait_for_copies<kStages - 2>();
       __syncthreads();  // this stage is there, and the one before has been read
       if (step + kStages - 1 < steps) fetch();
       commit_copies();
       if (row0 < sizes.m - first_m && column0 < sizes.n - first_n) {
-        multiply_stage<S, kOuter>(tiles[stage][0], tiles[stage][1], row0, column0, sizes.tf32, sum);
+        if (std::is_same_v<S, float> && sizes.tf32) {
+          multiply_stage<true>(tiles[stage][0], tiles[stage][1], row0, column0, sum);
+        } else {
+          multiply_stage<false>(tiles[stage][0], tiles[stage][1], row0, column0, sum);
+        }
       }
       stage = stage + 1 < kStages ? stage + 1 : 0;
     }
-    const int64_t row = first_m + row0 + lane_number() / 4, column = first_n + column0 + lane_number() % 4 * 2;
+    const int rows_here = int(sizes.m - first_m < kTileM ? sizes.m - first_m : kTileM);
 #pragma unroll
-    for (int i = 0; i < kPiecesM; ++i) {
+    for (int run = 0; run < 2 * kPiecesN / kColumns<kOuter>; ++run) {
+      const int64_t column = first_n + column0 + 8 * run + lane_number() % 4 * kColumns<kOuter>;
+      if (column >= sizes.n) continue;
+      const auto results = epilogue.at(column, part);
 #pragma unroll
-      for (int j = 0; j < kPiecesN; ++j) {
+      for (int i = 0; i < kPiecesM; ++i) {
+#pragma unroll
         for (int half = 0; half < 2; ++half) {
-          const int64_t r = row + 16 * i + 8 * half, c = column + 8 * j;
-          if (r < sizes.m && c < sizes.n) epilogue(r, c, part, sum[i][j][2 * half], sum[i][j][2 * half + 1]);
+          const int row = row0 + 16 * i + 8 * half + lane_number() / 4;
+          if (row >= rows_here) continue;
+          T value[kColumns<kOuter>];
+#pragma unroll
+          for (int v = 0; v < kColumns<kOuter>; ++v) value[v] = sum[i][run + v / 2][2 * half + v % 2];
+          results(first_m + row, value);
         }
       }
     }
@@ -422,11 +486,37 @@ void pack_rows(const From* from, int64_t row_stride, int64_t column_stride, int6
   launch_threads(pack_kernel<From, S>, rows * stride, from, row_stride, column_stride, rows, columns, stride, to);
 }
 
+// Whether rows of so many columns consist of whole chunks.
+template <typename S>
+bool in_chunks(const S* rows, int64_t columns) {
+  return columns % kChunk<S> == 0 && reinterpret_cast<uintptr_t>(rows) % 16 == 0;
+}
+
+// to[v] = value[v] for the first `count` of kColumns values, in whole chunks where rows hold such.
+template <typename S>
+PRED_DEVICE_ONLY void store_columns(S* to, bool chunks, int64_t count, const Compute<S> (&value)[kColumns<false>]) {
+  constexpr int V = kChunk<S>;
+#pragma unroll
+  for (int first = 0; first < kColumns<false>; first += V) {
+    Compute<S> part[V];
+#pragma unroll
+    for (int v = 0; v < V; ++v) part[v] = value[first + v];
+    if (chunks) {
+      if (first < count) store_pack<V>(to + first, part);
+    } else {
+#pragma unroll
+      for (int v = 0; v < V; ++v) {
+        if (first + v < count) narrow_to(to[first + v], part[v]);
+      }
+    }
+  }
+}
+
 // Rows as they are, where products can read them, or copied to `space`.
 template <typename S>
 ProductRows<S> readable_rows(const S* rows, int64_t columns, int64_t count, S* space) {
   const int64_t stride = whole_chunks<S>(columns);
-  if (stride == columns && reinterpret_cast<uintptr_t>(rows) % 16 == 0) return {rows, columns, count};
+  if (in_chunks(rows, columns)) return {rows, columns, count};
   pack_rows(rows, columns, int64_t(1), count, columns, stride, space);
   return {space, stride, count};
 }
@@ -439,10 +529,12 @@ struct AddToParts {
   int64_t m, n;
   bool set;
 
-  __device__ void operator()(int64_t row, int64_t column, int split, T value, T next) const {
-    T* to = parts + (split * m + row) * n + column;
-    put(to, value);
-    if (column + 1 < n) put(to + 1, next);
+  __device__ auto at(int64_t column, int split) const {
+    return [this, column, split](int64_t row, const T(&value)[2]) {
+      T* to = parts + (split * m + row) * n + column;
+      put(to, value[0]);
+      if (column + 1 < n) put(to + 1, value[1]);
+    };
   }
 
   __device__ void put(T* to, T value) const {

@@ -249,13 +249,84 @@ void gather(const FieldArgs<S>& a, const Space<S>& space, int64_t first, int64_t
 }
 
 // --- Epilogues -----------------------------------------------------------------------------------
-// s from a: 1 - exp(-beta a).
-template <typename T>
-PRED_DEVICE_ONLY T slope_of(const ExpScale<T>& beta, T activation) {
-  return -exp_nonpositive(beta, -activation).expm1;
+// 2^x for x <= 0, to 2e-7 of it; 0 below 2^-126.
+PRED_DEVICE_ONLY float approximate_exp2(float x) {
+#ifdef __CUDA_ARCH__
+  float value;
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(value) : "f"(x));
+  return value;
+#else
+  return __builtin_exp2f(x);
+#endif
 }
 
-// Results come in pairs of columns of rows of hidden width; those that fill up a row are 0.
+// What is stored as bfloat16 needs no more than this: relative errors below 1e-4, and of the slope absolute ones of
+// 2e-7.
+template <typename S>
+constexpr bool kApproximate = std::is_same_v<S, BFloat16>;
+
+// log(1 + exp(beta z)) / beta. Approximate: minimax fit of log(1 + e) / e, relative error 6e-5.
+template <typename S, typename T = Compute<S>>
+PRED_DEVICE_ONLY T softplus_of(const SoftplusScale<T>& beta, T z) {
+  if constexpr (kApproximate<S>) {
+    const float e = approximate_exp2(negative_magnitude(z) * beta.beta.high);
+    float sum = e * 0.041347265f - 0.15742713f;
+    sum = sum * e + 0.30630088f;
+    sum = sum * e - 0.49697781f;
+    sum = sum * e + 0.99994326f;
+    return (z < 0.0f ? 0.0f : z) + sum * e * beta.inverse;  // NaN stays NaN
+  } else {
+    return softplus(beta, z).value;
+  }
+}
+
+// The slope s = 1 - exp(-beta a) of an activation a, and 1 - s.
+template <typename T>
+struct Slope {
+  T value, rest;
+};
+
+template <typename S, typename T = Compute<S>>
+PRED_DEVICE_ONLY Slope<T> slope_of(const ExpScale<T>& beta, T activation) {
+  if constexpr (kApproximate<S>) {
+    const float e = approximate_exp2(-activation * beta.high);
+    return {1.0f - e, e};
+  } else {
+    const auto e = exp_nonpositive(beta, -activation);
+    return {-e.expm1, e.exp};
+  }
+}
+
+// Values of a row that an epilogue takes at once.
+template <typename S>
+using Columns = Compute<S>[kColumns<false>];
+
+// value[v] = from[v], but 0 from `count` on, in whole chunks; of memory that the kernel does not write, or does.
+template <bool kConstant, typename S>
+PRED_DEVICE_ONLY void load_columns(const S* from, int64_t count, Columns<S>& value) {
+  constexpr int V = kChunk<S>;
+#pragma unroll
+  for (int first = 0; first < kColumns<false>; first += V) {
+    Compute<S> part[V];
+    const S* chunk = first < count ? from + first : nullptr;
+    if constexpr (kConstant) {
+      load_constant_pack<V>(chunk, part);
+    } else {
+      load_pack<V>(chunk, part);
+    }
+#pragma unroll
+    for (int v = 0; v < V; ++v) value[first + v] = part[v];
+  }
+}
+
+// Results for rows of hidden width, those that fill up a row being 0.
+template <typename S>
+PRED_DEVICE_ONLY void store_hidden(S* to, int64_t left, Columns<S>& value) {
+#pragma unroll
+  for (int v = 1; v < kColumns<false>; ++v) value[v] = v < left ? value[v] : Compute<S>(0);
+  store_columns(to, true, left, value);
+}
+
 template <typename S, typename T = Compute<S>>
 struct Activate {
   SoftplusScale<T> beta;
@@ -264,17 +335,22 @@ struct Activate {
   int64_t width, stride;
   S* out;
 
-  __device__ void operator()(int64_t row, int64_t column, int, T value, T next) const {
-    const int64_t at = row * stride + column;
-    T result[2] = {value, next}, from_map[2] = {};
-    if (gathered) load_constant_pack<2>(gathered + at, from_map);
+  __device__ auto at(int64_t column, int) const {
+    const int64_t left = width - column;
+    Columns<S> add;
 #pragma unroll
-    for (int v = 0; v < 2; ++v) {
-      const bool there = column + v < width;
-      const T z = there ? result[v] + bias[column + v] : T(0);
-      result[v] = there ? softplus(beta, gathered ? z + from_map[v] : z).value : T(0);
-    }
-    store_pack<2>(out + at, result);
+    for (int v = 0; v < kColumns<false>; ++v) add[v] = v < left ? bias[column + v] : T(0);
+    return [this, column, left, add](int64_t row, const Columns<S>& value) {
+      const int64_t at = row * stride + column;
+      Columns<S> result, from_map = {};
+      if (gathered) load_columns<true>(gathered + at, left, from_map);
+#pragma unroll
+      for (int v = 0; v < kColumns<false>; ++v) {
+        const T z = value[v] + add[v];
+        result[v] = softplus_of<S>(beta, gathered ? z + from_map[v] : z);
+      }
+      store_hidden(out + at, left, result);
+    };
   }
 };
 
@@ -286,13 +362,15 @@ struct Chain {
   int64_t width, stride;
   S* out;
 
-  __device__ void operator()(int64_t row, int64_t column, int, T value, T next) const {
-    const int64_t at = row * stride + column;
-    T result[2] = {value, next}, a[2];
-    load_constant_pack<2>(activation + at, a);
+  __device__ auto at(int64_t column, int) const {
+    return [this, column](int64_t row, const Columns<S>& value) {
+      const int64_t at = row * stride + column, left = width - column;
+      Columns<S> result, a;
+      load_columns<true>(activation + at, left, a);
 #pragma unroll
-    for (int v = 0; v < 2; ++v) result[v] = column + v < width ? result[v] * slope_of(beta, a[v]) : T(0);
-    store_pack<2>(out + at, result);
+      for (int v = 0; v < kColumns<false>; ++v) result[v] = value[v] * slope_of<S>(beta, a[v]).value;
+      store_hidden(out + at, left, result);
+    };
   }
 };
 
@@ -305,22 +383,23 @@ struct Tangent {
   int64_t width, stride;
   S *rate, *back;
 
-  __device__ void operator()(int64_t row, int64_t column, int, T value, T next) const {
-    const int64_t at = row * stride + column;
-    T y[2] = {value, next}, from_map[2] = {}, a[2], g[2], q[2];
-    load_constant_pack<2>(activation + at, a);
-    load_constant_pack<2>(chain + at, g);
-    if (gathered) load_constant_pack<2>(gathered + at, from_map);
+  __device__ auto at(int64_t column, int) const {
+    return [this, column](int64_t row, const Columns<S>& value) {
+      const int64_t at = row * stride + column, left = width - column;
+      Columns<S> y, q, a, g, from_map = {};
+      load_columns<true>(activation + at, left, a);
+      load_columns<true>(chain + at, left, g);
+      if (gathered) load_columns<true>(gathered + at, left, from_map);
 #pragma unroll
-    for (int v = 0; v < 2; ++v) {
-      const bool there = column + v < width;
-      if (gathered) y[v] += from_map[v];
-      const T s = slope_of(beta, a[v]);
-      q[v] = there ? g[v] * y[v] * (beta_value - beta_value * s) : T(0);
-      y[v] = there ? s * y[v] : T(0);
-    }
-    store_pack<2>(rate + at, y);
-    store_pack<2>(back + at, q);
+      for (int v = 0; v < kColumns<false>; ++v) {
+        y[v] = gathered ? value[v] + from_map[v] : value[v];
+        const Slope<T> s = slope_of<S>(beta, a[v]);
+        q[v] = g[v] * y[v] * (beta_value * s.rest);
+        y[v] *= s.value;
+      }
+      store_hidden(rate + at, left, y);
+      store_hidden(back + at, left, q);
+    };
   }
 };
 
@@ -333,17 +412,19 @@ struct Reverse {
   int64_t width, stride;
   S* back;
 
-  __device__ void operator()(int64_t row, int64_t column, int, T value, T next) const {
-    const int64_t at = row * stride + column;
-    T x[2] = {value, next}, a[2], q[2] = {};
-    load_constant_pack<2>(activation + at, a);
-    if (has_tangents) load_pack<2>(back + at, q);
+  __device__ auto at(int64_t column, int) const {
+    return [this, column](int64_t row, const Columns<S>& value) {
+      const int64_t at = row * stride + column, left = width - column;
+      Columns<S> x, a, q = {};
+      load_columns<true>(activation + at, left, a);
+      if (has_tangents) load_columns<false>(back + at, left, q);
 #pragma unroll
-    for (int v = 0; v < 2; ++v) {
-      x[v] *= slope_of(beta, a[v]);
-      x[v] = column + v >= width ? T(0) : has_tangents ? x[v] + q[v] : x[v];
-    }
-    store_pack<2>(back + at, x);
+      for (int v = 0; v < kColumns<false>; ++v) {
+        x[v] = value[v] * slope_of<S>(beta, a[v]).value;
+        x[v] = has_tangents ? x[v] + q[v] : x[v];
+      }
+      store_hidden(back + at, left, x);
+    };
   }
 };
 
@@ -353,9 +434,10 @@ struct StoreFew {
   T* out;
   int64_t columns;
 
-  __device__ void operator()(int64_t row, int64_t column, int, T value, T next) const {
-    out[row * columns + column] = value;
-    if (column + 1 < columns) out[row * columns + column + 1] = next;
+  __device__ auto at(int64_t column, int) const {
+    return [this, column](int64_t row, const T(&value)[kColumns<false>]) {
+      store_columns(out + row * columns + column, false, columns - column, value);
+    };
   }
 };
 
@@ -365,12 +447,17 @@ struct StoreOutputs {
   T sdf_scale, *sdf, *semantics;
   int64_t classes;
 
-  __device__ void operator()(int64_t row, int64_t column, int, T value, T next) const {
-    if (column == 0)
-      sdf[row] = (value + bias[0]) * sdf_scale;
-    else
-      semantics[row * classes + column - 1] = value + bias[column];
-    if (column < classes) semantics[row * classes + column] = next + bias[column + 1];
+  __device__ auto at(int64_t column, int) const {
+    return [this, column](int64_t row, const T(&value)[kColumns<false>]) {
+#pragma unroll
+      for (int v = 0; v < kColumns<false>; ++v) {
+        const int64_t c = column + v;
+        if (c == 0)
+          sdf[row] = (value[v] + bias[0]) * sdf_scale;
+        else if (c <= classes)
+          semantics[row * classes + c - 1] = value[v] + bias[c];
+      }
+    };
   }
 };
 
@@ -410,7 +497,7 @@ __global__ void last_of_chain_kernel(ExpScale<T> beta, const T* sdf_row, T sdf_s
                                      int64_t width, int64_t columns, int64_t stride, int64_t rows, S* out) {
   for (int64_t i = first_thread(); i < rows * columns; i += thread_stride()) {
     const int64_t row = divide(i, columns), c = i - row * columns, at = row * stride + c;
-    narrow_to(out[at], c < width ? slope_of(beta, widen(activation[at])) * (sdf_row[c] * sdf_scale) : T(0));
+    narrow_to(out[at], c < width ? slope_of<S>(beta, widen(activation[at])).value * (sdf_row[c] * sdf_scale) : T(0));
   }
 }
 

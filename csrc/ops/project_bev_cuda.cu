@@ -14,10 +14,12 @@ template <typename S>
 struct StoreRows {
   S* out;
   int64_t stride;
+  bool chunks = in_chunks(out, stride);
 
-  __device__ void operator()(int64_t row, int64_t column, int, Compute<S> value, Compute<S> next) const {
-    narrow_to(out[row * stride + column], value);
-    if (column + 1 < stride) narrow_to(out[row * stride + column + 1], next);
+  __device__ auto at(int64_t column, int) const {
+    return [this, column](int64_t row, const Compute<S>(&value)[kColumns<false>]) {
+      store_columns(out + row * stride + column, chunks, stride - column, value);
+    };
   }
 };
 

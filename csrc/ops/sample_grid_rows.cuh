@@ -4,58 +4,12 @@
 // Rows of channels on the device: a group of lanes moves a row, 16 bytes to an access where rows allow it.
 #pragma once
 
-#include <type_traits>
-
+#include "common/pack.cuh"
 #include "common/warp.cuh"
 #include "ops/sample_grid.h"
 
 namespace pred::PRED_ISA {
 namespace {
-
-// Neighbouring channels that one access moves.
-template <typename S, int V>
-struct alignas(V * sizeof(S)) Pack {
-  S x[V];
-};
-
-// value[v] = from[v], or 0 where there is none.
-template <int V, typename S>
-PRED_DEVICE_ONLY void load_pack(const S* from, Compute<S> (&value)[V]) {
-  Pack<S, V> pack;
-  if (from) pack = *reinterpret_cast<const Pack<S, V>*>(from);
-#pragma unroll
-  for (int v = 0; v < V; ++v) value[v] = from ? widen(pack.x[v]) : Compute<S>(0);
-}
-
-// The same of memory that the kernel does not write, so that loads may go ahead of stores.
-template <int V, typename S>
-PRED_DEVICE_ONLY void load_constant_pack(const S* from, Compute<S> (&value)[V]) {
-  Pack<S, V> pack{};
-  if (!from) {
-#pragma unroll
-    for (int v = 0; v < V; ++v) value[v] = Compute<S>(0);
-    return;
-  }
-#ifdef __CUDA_ARCH__
-  using Small = std::conditional_t<sizeof(pack) == 2, unsigned short, unsigned>;
-  using Word = std::conditional_t<sizeof(pack) <= 4, Small, std::conditional_t<sizeof(pack) == 8, uint2, uint4>>;
-  static_assert(sizeof(Word) == sizeof(pack));
-  const Word word = __ldg(reinterpret_cast<const Word*>(from));
-  __builtin_memcpy(&pack, &word, sizeof word);
-#else
-  pack = *reinterpret_cast<const Pack<S, V>*>(from);
-#endif
-#pragma unroll
-  for (int v = 0; v < V; ++v) value[v] = widen(pack.x[v]);
-}
-
-template <int V, typename S>
-PRED_DEVICE_ONLY void store_pack(S* to, const Compute<S> (&value)[V]) {
-  Pack<S, V> pack;
-#pragma unroll
-  for (int v = 0; v < V; ++v) pack.x[v] = narrow<S>(value[v]);
-  *reinterpret_cast<Pack<S, V>*>(to) = pack;
-}
 
 // Lanes that share one sample, a power of 2.
 struct Group {

@@ -5,8 +5,8 @@
 //   out[o]      = bias + sum over taps k, i = out_to_in[o, k], of W_k features[i]
 //   grad_in[i]  = sum over taps k, o = in_to_out[i, k], of W_k^T grad[o]
 //   grad_W_k    = sum over outputs o, i = out_to_in[o, k], of grad[o] features[i]^T
-// The first two are one product along a table; a table's -1 is left out. Rows are stored as S, multiplied as
-// Factor<S> and added up as Compute<S>.
+// The first two are one product along a table; a table's -1 is left out. Rows are stored as S, on the CPU multiplied as
+// Factor<S>, and added up as Compute<S>.
 #pragma once
 
 #include <type_traits>
@@ -16,7 +16,7 @@
 
 namespace pred {
 
-// There are no products of float16: its rows are widened when they are gathered.
+// The CPU has no products of float16: its rows are widened when they are gathered.
 template <typename S>
 using Factor = std::conditional_t<std::is_same_v<S, Float16>, float, S>;
 

@@ -12,15 +12,15 @@ namespace pred::PRED_ISA {
 namespace {
 
 // Row i of tap `segment`: the one that the table names.
-template <typename F>
+template <typename S>
 struct TableRows {
   static constexpr bool kSparse = true;
-  const F* data;
+  const S* data;
   int64_t stride, numbers;
   const int32_t* table;
   int64_t taps, rows;
 
-  __device__ const F* row(int64_t i, int segment) const {
+  __device__ const S* row(int64_t i, int segment) const {
     if (i >= rows) return nullptr;
     const int64_t number = table[i * taps + segment];
     return number >= 0 && number < numbers ? data + number * stride : nullptr;
@@ -28,12 +28,12 @@ struct TableRows {
 };
 
 // Matrices [taps, outputs, stride] side by side.
-template <typename F>
+template <typename S>
 struct TapRows {
-  const F* data;
+  const S* data;
   int64_t stride, outputs;
 
-  __device__ const F* row(int64_t i, int segment) const {
+  __device__ const S* row(int64_t i, int segment) const {
     return i < outputs ? data + (segment * outputs + i) * stride : nullptr;
   }
 };
@@ -43,22 +43,32 @@ struct StoreWithBias {
   const S* bias;  // or null
   S* out;
   int64_t columns;
+  bool chunks = in_chunks(out, columns);
 
-  __device__ void operator()(int64_t row, int64_t column, int, Compute<S> value, Compute<S> next) const {
-    S* to = out + row * columns + column;
-    narrow_to(to[0], bias ? value + widen(bias[column]) : value);
-    if (column + 1 < columns) narrow_to(to[1], bias ? next + widen(bias[column + 1]) : next);
+  __device__ auto at(int64_t column, int) const {
+    using T = Compute<S>;
+    T add[kColumns<false>] = {};
+#pragma unroll
+    for (int v = 0; v < kColumns<false>; ++v) {
+      if (bias && column + v < columns) add[v] = widen(bias[column + v]);
+    }
+    return [this, column, add](int64_t row, const T(&value)[kColumns<false>]) {
+      T result[kColumns<false>];
+#pragma unroll
+      for (int v = 0; v < kColumns<false>; ++v) result[v] = bias ? value[v] + add[v] : value[v];
+      store_columns(out + row * columns + column, chunks, columns - column, result);
+    };
   }
 };
 
 // to[tap, n, k] = weight[n, tap, k], or weight[k, tap, n] if transposed; 0 in columns that fill up a row.
-template <typename S, typename F>
+template <typename S>
 __global__ void pack_taps_kernel(const S* weight, int64_t taps, int64_t inputs, int64_t outputs, int64_t stride,
-                                 bool transposed, F* to) {
+                                 bool transposed, S* to) {
   for (int64_t i = first_thread(); i < taps * outputs * stride; i += thread_stride()) {
     const int64_t row = i / stride, k = i - row * stride, tap = row / outputs, n = row - tap * outputs;
     const int64_t from = transposed ? (k * taps + tap) * outputs + n : (n * taps + tap) * inputs + k;
-    narrow_to(to[i], k < inputs ? Compute<F>(widen(weight[from])) : Compute<F>(0));
+    to[i] = k < inputs ? weight[from] : S{};
   }
 }
 
@@ -77,19 +87,18 @@ __global__ void write_weight_kernel(const T* parts, int splits, int64_t taps, in
 
 template <typename S>
 struct Space {
-  using F = Factor<S>;
-  F *source, *grad, *weight;
+  S *source, *grad, *weight;
   Compute<S>* parts;
   int splits;
   int64_t bytes;
 
   Space(const SparseConvArgs<S>& a, bool of_weight, int64_t rows, int64_t source_rows, char* memory) {
     Workspace space(memory);
-    const int64_t inputs = whole_chunks<F>(a.inputs);
+    const int64_t inputs = whole_chunks<S>(a.inputs);
     splits = outer_splits(a.outputs, a.inputs, rows, a.taps);
-    source = space.take<F>(source_rows * inputs);
-    grad = space.take<F>(of_weight ? rows * whole_chunks<F>(a.outputs) : 0);
-    weight = space.take<F>(of_weight ? 0 : a.taps * a.outputs * inputs);
+    source = space.take<S>(source_rows * inputs);
+    grad = space.take<S>(of_weight ? rows * whole_chunks<S>(a.outputs) : 0);
+    weight = space.take<S>(of_weight ? 0 : a.taps * a.outputs * inputs);
     parts = space.take<Compute<S>>(of_weight ? a.taps * splits * a.outputs * a.inputs : 0);
     bytes = space.bytes();
   }
@@ -100,44 +109,30 @@ int64_t workspace_bytes(const SparseConvArgs<S>& a, bool of_weight, int64_t rows
   return Space<S>(a, of_weight, rows, source_rows, nullptr).bytes;
 }
 
-// Rows as factors: as they are where products can read them.
-template <typename S, typename F = Factor<S>>
-ProductRows<F> factor_rows(const S* rows, int64_t columns, int64_t count, F* space) {
-  if constexpr (std::is_same_v<S, F>) {
-    return readable_rows(rows, columns, count, space);
-  } else {
-    const int64_t stride = whole_chunks<F>(columns);
-    pack_rows(rows, columns, int64_t(1), count, columns, stride, space);
-    return {space, stride, count};
-  }
-}
-
-template <typename S, typename F = Factor<S>>
-TableRows<F> table_rows(const SparseConvArgs<S>& a, const ProductRows<F>& source, int64_t rows) {
+template <typename S>
+TableRows<S> table_rows(const SparseConvArgs<S>& a, const ProductRows<S>& source, int64_t rows) {
   return {source.data, source.stride, source.rows, a.table, a.taps, rows};
 }
 
 template <typename S>
 void product(const SparseConvArgs<S>& a, const S* weight, bool transposed, S* out, char* workspace, int64_t rows,
              int64_t source_rows) {
-  using F = Factor<S>;
   const Space<S> space(a, false, rows, source_rows, workspace);
-  const int64_t stride = whole_chunks<F>(a.inputs);
-  launch_threads(pack_taps_kernel<S, F>, a.taps * a.outputs * stride, weight, a.taps, a.inputs, a.outputs, stride,
+  const int64_t stride = whole_chunks<S>(a.inputs);
+  launch_threads(pack_taps_kernel<S>, a.taps * a.outputs * stride, weight, a.taps, a.inputs, a.outputs, stride,
                  transposed, space.weight);
-  const ProductRows<F> source = factor_rows(a.source, a.inputs, source_rows, space.source);
-  launch_product<F, false>({rows, a.outputs, stride, int(a.taps), 1, a.tf32, false}, table_rows(a, source, rows),
-                           TapRows<F>{space.weight, stride, a.outputs}, StoreWithBias<S>{a.bias, out, a.outputs});
+  const ProductRows<S> source = readable_rows(a.source, a.inputs, source_rows, space.source);
+  launch_product<S, false>({rows, a.outputs, stride, int(a.taps), 1, a.tf32, false}, table_rows(a, source, rows),
+                           TapRows<S>{space.weight, stride, a.outputs}, StoreWithBias<S>{a.bias, out, a.outputs});
 }
 
 template <typename S>
 void weight(const SparseConvArgs<S>& a, S* grad_weight, char* workspace, int64_t rows, int64_t source_rows) {
-  using F = Factor<S>;
   using T = Compute<S>;
   const Space<S> space(a, true, rows, source_rows, workspace);
-  const ProductRows<F> source = factor_rows(a.source, a.inputs, source_rows, space.source);
-  const ProductRows<F> grad = factor_rows(a.grad, a.outputs, rows, space.grad);
-  launch_product<F, true>({a.outputs, a.inputs, rows, int(a.taps), space.splits, a.tf32, true}, grad,
+  const ProductRows<S> source = readable_rows(a.source, a.inputs, source_rows, space.source);
+  const ProductRows<S> grad = readable_rows(a.grad, a.outputs, rows, space.grad);
+  launch_product<S, true>({a.outputs, a.inputs, rows, int(a.taps), space.splits, a.tf32, true}, grad,
                           table_rows(a, source, rows), AddToParts<T>{space.parts, a.outputs, a.inputs, true});
   launch_threads(write_weight_kernel<S>, a.taps * a.outputs * a.inputs, static_cast<const T*>(space.parts),
                  space.splits, a.taps, a.outputs, a.inputs, grad_weight);
