@@ -102,6 +102,7 @@ cuda-compile: $(VENV)/dev.stamp
 	$(BIN)/cmake -G Ninja -S . -B build/cuda -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN))/ninja -DPRED_CUDA=ON -DPRED_HOST=OFF \
 		-DPRED_TORCH_DIR=$$($(BIN)/python -c "import pathlib, torch; print(pathlib.Path(torch.__file__).parent)")
 	$(BIN)/cmake --build build/cuda --target pred_cuda
+	$(PIP) install nvidia-cuda-cuobjdump nvidia-cuda-nvdisasm
 	PRED_TEST_CUDA_LIBRARY=build/cuda/libpred_cuda.so $(BIN)/python -m pytest tests/test_cuda_library.py
 
 # In place, for the GPUs that are there.

@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 from pathlib import Path
 
 import pytest
@@ -40,13 +41,61 @@ def test_undefined_symbols_are_stable() -> None:
     assert not [name for name in needed if re.search("gomp|python|cublas|cudnn", name)]
 
 
+def dumped(*arguments: str) -> str:
+    """What cuobjdump says: that of PyPI, of the toolkit, or of PATH."""
+    places = [
+        *Path(sysconfig.get_path("purelib")).glob("nvidia/cu*/bin"),
+        Path(shutil.which("nvcc") or "").resolve().parent,
+    ]
+    path = os.pathsep.join([*map(str, places), os.environ["PATH"]])
+    dumper = shutil.which("cuobjdump", path=path)
+    if dumper is None or shutil.which("nvdisasm", path=path) is None:
+        pytest.skip("cuobjdump and nvdisasm are not installed")
+    return subprocess.run(
+        [dumper, *arguments], env=os.environ | {"PATH": path}, capture_output=True, text=True, check=True
+    ).stdout
+
+
 def test_machine_code_of_every_architecture() -> None:
-    dumper = shutil.which("cuobjdump") or str(Path(os.path.realpath(shutil.which("nvcc") or "")).with_name("cuobjdump"))
-    if not Path(dumper).exists():
-        pytest.skip("cuobjdump is not installed")
-    names = set(re.findall(r"sm_\d+", listed(dumper, "--list-elf", str(LIBRARY))))
+    names = set(re.findall(r"sm_\d+", dumped("--list-elf", str(LIBRARY))))
     assert names >= {"sm_75", "sm_80", "sm_86", "sm_89", "sm_90"}
-    assert "sm_90" in listed(dumper, "--list-ptx", str(LIBRARY))
+    assert "sm_90" in dumped("--list-ptx", str(LIBRARY))
+
+
+@pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
+@pytest.mark.parametrize("op", ["decode_field", "project_bev", "sparse_conv"])
+def test_products_run_on_tensor_cores(op: str, arch: str) -> None:
+    """Of halves and of float32; fed by matrix loads from shared memory that is filled without registers between."""
+    objects = LIBRARY.parent / "CMakeFiles/pred_cuda.dir/csrc/ops"
+    code = dumped("-sass", "-arch", arch, str(objects / f"{op}_cuda.cu.o"))
+    multiply = {"8BFloat16": r"HMMA\.16816\.F32\.BF16", "7Float16": r"HMMA\.16816\.F32 ", "f": r"HMMA\.1688\.F32\.TF32"}
+    seen = set()
+    for function in code.split("Function : ")[1:]:
+        name = function.split(maxsplit=1)[0]
+        found = re.search(r"product_kernelI(?:NS\d?_)?(8BFloat16|7Float16|f|d)E?Lb([01])E", name)
+        if not found or found[1] == "d":
+            continue
+        kind, outer = found.groups()
+        assert re.search(multiply[kind], function), name
+        assert "LDGSTS.E.BYPASS.128" in function, name
+        assert ("LDSM" in function) == (kind != "f" or outer == "0"), name  # not of columns of 4 bytes
+        seen.add((kind, outer))
+    kinds = ["8BFloat16", "f", *(["7Float16"] if op == "sparse_conv" else [])]
+    assert seen == {(kind, outer) for kind in kinds for outer in "01"}
+
+
+def test_two_blocks_of_products_fit_a_multiprocessor() -> None:
+    """By their registers; and no kernel of the library keeps much beside them."""
+    lines = dumped("--dump-resource-usage", "-arch", "sm_90", str(LIBRARY)).splitlines()
+    kernels = {
+        lines[i - 1].split()[1].rstrip(":"): dict(re.findall(r"(REG|STACK):(\d+)", line))
+        for i, line in enumerate(lines)
+        if "REG:" in line and "4pred" in lines[i - 1]
+    }
+    assert len(kernels) > 200
+    assert max(int(use["STACK"]) for use in kernels.values()) <= 128
+    products = [int(use["REG"]) for name, use in kernels.items() if re.search("product_kernelI(?!dL)", name)]
+    assert products and max(products) * 512 <= 65536
 
 
 def test_every_op_and_its_gradient_is_registered(tmp_path: Path) -> None:
