@@ -22,7 +22,7 @@ struct GivenField {
   }
 };
 
-template <bool kSource, bool kValues, typename S, typename T = Compute<S>>
+template <bool kSource, bool kValues, int V, typename S, typename T = Compute<S>>
 __global__ void __launch_bounds__(kThreads)
     backward_kernel(CompositeAlphaArgs<S> a, CompositeCotangents<S> grad, CompositeGradients<S> out, int64_t num_rays) {
   __shared__ Tile<T> tiles[kThreads / kWarp];
@@ -44,7 +44,7 @@ __global__ void __launch_bounds__(kThreads)
       if (out.t && there) {
         out.t[at + i] = position_gradient(a.depth_mid, grad.depth[ray], weight, before, i, count);
       }
-      if (kValues) channel_gradients<false, true>(a, grad, out, weight, ray, at + first, count - first, tile);
+      if (kValues) channel_gradients<V, false, true>(a, grad, out, weight, ray, at + first, count - first, tile);
       transmittance *= broadcast(product, kWarp - 1);
       weight_before = broadcast(weight, kWarp - 1);
     }
@@ -56,7 +56,7 @@ __global__ void __launch_bounds__(kThreads)
       const bool there = i < count;
       T own = there ? cotangent(a, grad, ray, at, i, count) : T(0);
       if (grad.values) {
-        const T dot = channel_gradients<true, false>(a, grad, out, T(0), ray, at + first, count - first, tile);
+        const T dot = channel_gradients<V, true, false>(a, grad, out, T(0), ray, at + first, count - first, tile);
         if (there) own += dot;
       }
       // D_i = value + factor D_{i+1}
@@ -83,10 +83,16 @@ template <typename S, typename T = Compute<S>>
 void backward(const CompositeAlphaArgs<S>& a, const CompositeSaved<T>&, const CompositeCotangents<S>& grad,
               const CompositeGradients<S>& out, T*, int64_t, int64_t, int64_t num_rays) {
   const bool source = out.source != nullptr, values = out.values != nullptr;
-  const auto kernel = source   ? values ? backward_kernel<true, true, S> : backward_kernel<true, false, S>
-                      : values ? backward_kernel<false, true, S>
-                               : backward_kernel<false, false, S>;
-  launch_warps(kernel, num_rays, a, grad, out, num_rays);
+  by_channels<S>(
+      a.channels,
+      [&](auto channels) {
+        constexpr int V = decltype(channels)::value;
+        const auto kernel = source   ? values ? backward_kernel<true, true, V, S> : backward_kernel<true, false, V, S>
+                            : values ? backward_kernel<false, true, V, S>
+                                     : backward_kernel<false, false, V, S>;
+        launch_warps(kernel, num_rays, a, grad, out, num_rays);
+      },
+      a.values, grad.values, out.values);
 }
 
 }  // namespace

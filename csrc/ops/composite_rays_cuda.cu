@@ -43,7 +43,7 @@ PRED_DEVICE_ONLY Sample<T> first_sample(const Sample<T>& own) {
   return {broadcast(own.sdf, 0), broadcast(own.cotangent, 0), broadcast(own.h, 0), broadcast(own.falls, 0)};
 }
 
-template <bool kSource, bool kValues, typename S, typename T = Compute<S>>
+template <bool kSource, bool kValues, int V, typename S, typename T = Compute<S>>
 __global__ void __launch_bounds__(kThreads)
     backward_kernel(CompositeRaysArgs<S> a, CompositeSaved<T> saved, CompositeCotangents<S> grad,
                     CompositeGradients<S> out, int64_t num_rays) {
@@ -68,7 +68,8 @@ __global__ void __launch_bounds__(kThreads)
       Sample<T> own{};
       if (kSource && there) own.cotangent = cotangent(a, grad, ray, at, i, count);
       if (grad.values) {
-        const T dot = channel_gradients<kSource, kValues>(a, grad, out, weight, ray, at + first, count - first, tile);
+        const T dot =
+            channel_gradients<V, kSource, kValues>(a, grad, out, weight, ray, at + first, count - first, tile);
         if (there) own.cotangent += dot;
       }
       if (!kSource) continue;
@@ -106,10 +107,16 @@ template <typename S, typename T = Compute<S>>
 void backward(const CompositeRaysArgs<S>& a, const CompositeSaved<T>& saved, const CompositeCotangents<S>& grad,
               const CompositeGradients<S>& out, T*, int64_t, int64_t, int64_t num_rays) {
   const bool source = out.source || out.inv_s, values = out.values != nullptr;
-  const auto kernel = source   ? values ? backward_kernel<true, true, S> : backward_kernel<true, false, S>
-                      : values ? backward_kernel<false, true, S>
-                               : backward_kernel<false, false, S>;
-  launch_warps(kernel, num_rays, a, saved, grad, out, num_rays);
+  by_channels<S>(
+      a.channels,
+      [&](auto channels) {
+        constexpr int V = decltype(channels)::value;
+        const auto kernel = source   ? values ? backward_kernel<true, true, V, S> : backward_kernel<true, false, V, S>
+                            : values ? backward_kernel<false, true, V, S>
+                                     : backward_kernel<false, false, V, S>;
+        launch_warps(kernel, num_rays, a, saved, grad, out, num_rays);
+      },
+      a.values, grad.values, out.values);
 }
 
 }  // namespace
