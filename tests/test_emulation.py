@@ -120,6 +120,7 @@ def test_tensors_that_begin_anywhere(native: None, deterministic: None) -> None:
             ops.sparse_conv(place(features), place(weight)[:, None], table, table),
         ]
         found.append(results)
+        assert rays.values is not None
         rendered.append(rays.values)
     assert_close(rendered[1], rendered[0], FORWARD[torch.float32])  # as many samples at a time as packs of channels fit
     for here, there in zip(*found, strict=True):

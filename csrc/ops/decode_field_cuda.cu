@@ -249,7 +249,7 @@ void gather(const FieldArgs<S>& a, const Space<S>& space, int64_t first, int64_t
 }
 
 // --- Epilogues -----------------------------------------------------------------------------------
-// 2^x for x <= 0, to 2e-7 of it; 0 below 2^-126.
+// 2^x for x <= 0, to 3e-7 of it; 0 below 2^-126.
 PRED_DEVICE_ONLY float approximate_exp2(float x) {
 #ifdef __CUDA_ARCH__
   float value;
