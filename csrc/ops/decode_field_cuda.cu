@@ -261,7 +261,7 @@ PRED_DEVICE_ONLY float approximate_exp2(float x) {
 }
 
 // What is stored as bfloat16 needs no more than this: relative errors below 1e-4, and of the slope absolute ones of
-// 2e-7.
+// 3e-7.
 template <typename S>
 constexpr bool kApproximate = std::is_same_v<S, BFloat16>;
 
