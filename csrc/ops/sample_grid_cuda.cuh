@@ -9,9 +9,9 @@
 // one cell of the map and adds up what up to 4 (8) of these runs send to it, in their order: no two threads write one
 // address, and the sums have the same bits every time. Rays start in one place, so runs can be long there: pieces of
 // kPiece items, at multiples of it, that lie within one run are added up beforehand, each by a warp of its own.
-// Scatter with atomics, where the order of a sum may be another every time: a group takes kRun neighbouring samples and
-// adds them up in registers as long as they lie in one cell, as those along a ray do; then all of its lanes add to the
-// map.
+// Scatter with atomics, where the order of a sum may be another every time: a group takes as many neighbouring samples
+// as it has lanes and adds them up in registers as long as they lie in one cell, as those along a ray do; then its
+// lanes add to the map.
 #pragma once
 
 #include "common/bits.h"
@@ -36,8 +36,36 @@ PRED_DEVICE_ONLY const S* gradient_row(const SampleGridArgs<S, Axes>& a, int64_t
   return a.grad_slopes + (sample * Axes + m - 1) * a.channels;
 }
 
-// A warp has 32 neighbouring samples: each lane finds the corners and weights of one, which the groups then take in
-// turn.
+// The cell of one sample: where its lower corner lies in the maps, or would, and which corners lie inside.
+struct Cell {
+  int64_t offset = 0;
+  unsigned inside = 0;
+};
+
+template <typename S, int Axes>
+PRED_DEVICE_ONLY Cell find_cell(const SampleGridArgs<S, Axes>& a, int64_t map,
+                                const LinearStencil<Compute<S>, Axes>& s) {
+  Cell cell;
+  cell.offset = map * a.stride[Axes];
+  for (int axis = 0; axis < Axes; ++axis) cell.offset += s.axis[axis].low * a.stride[axis];
+#pragma unroll
+  for (int k = 0; k < 1 << Axes; ++k) cell.inside |= unsigned(linear_inside(s, k)) << k;
+  return cell;
+}
+
+PRED_DEVICE_ONLY Cell cell_of_lane(const Cell& own, int from) {
+  return {broadcast(own.offset, from), broadcast(own.inside, from)};
+}
+
+// From the lower corner to corner k.
+template <typename S, int Axes>
+PRED_DEVICE_ONLY int64_t to_corner(const SampleGridArgs<S, Axes>& a, int k) {
+  int64_t step = 0;
+  for (int axis = 0; axis < Axes; ++axis) step += (k >> axis & 1) * a.stride[axis];
+  return step;
+}
+
+// A warp has 32 neighbouring samples: each lane finds the cell and weights of one, which the groups then take in turn.
 template <int kOuts, int V, typename S, int Axes>
 __global__ void __launch_bounds__(kThreads)
     forward_kernel(SampleGridArgs<S, Axes> a, S* out, S* slopes, int64_t num_samples, int lanes) {
@@ -47,20 +75,16 @@ __global__ void __launch_bounds__(kThreads)
   for (int64_t base = first_warp() * kWarp; base < num_samples; base += warp_stride() * kWarp) {
     const int64_t own = base + lane_number();
     T own_weight[kOuts][kCorners] = {};
-    int64_t own_offset = 0;
-    unsigned own_inside = 0;
+    Cell own_cell;
     if (own < num_samples) {
       const auto s = stencil(a, own);
       forward_weights<kOuts>(s, own_weight);
-      own_offset = divide(own, a.num_samples) * a.stride[Axes];
-      for (int axis = 0; axis < Axes; ++axis) own_offset += s.axis[axis].low * a.stride[axis];
-#pragma unroll
-      for (int k = 0; k < kCorners; ++k) own_inside |= unsigned(linear_inside(s, k)) << k;
+      own_cell = find_cell(a, divide(own, a.num_samples), s);
     }
     for (int turn = 0; turn < kWarp && base + turn < num_samples; turn += group.per_warp()) {
       const int from = turn + group.number();
-      const int64_t sample = base + from, offset = broadcast(own_offset, from);
-      const unsigned inside = broadcast(own_inside, from);
+      const int64_t sample = base + from;
+      const Cell cell = cell_of_lane(own_cell, from);
       T weight[kOuts][kCorners];
 #pragma unroll
       for (int m = 0; m < kOuts; ++m) {
@@ -71,10 +95,8 @@ __global__ void __launch_bounds__(kThreads)
         T sum[kOuts][V] = {};
 #pragma unroll
         for (int k = 0; k < kCorners; ++k) {
-          int64_t at = offset + c;
-          for (int axis = 0; axis < Axes; ++axis) at += (k >> axis & 1) * a.stride[axis];
           T value[V];
-          load_constant_pack<V>(inside >> k & 1 ? a.map + at : nullptr, value);
+          load_constant_pack<V>(cell.inside >> k & 1 ? a.map + (cell.offset + to_corner(a, k) + c) : nullptr, value);
 #pragma unroll
           for (int m = 0; m < kOuts; ++m) {
             for (int v = 0; v < V; ++v) sum[m][v] += value[v] * weight[m][k];
@@ -385,8 +407,6 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 // --- Scatter with atomics ------------------------------------------------------------------------
-constexpr int64_t kRun = 16;
-
 template <int V, typename T>
 PRED_DEVICE_ONLY void add_pack(T* to, const T (&value)[V]) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
@@ -400,50 +420,58 @@ PRED_DEVICE_ONLY void add_pack(T* to, const T (&value)[V]) {
   }
 }
 
+// A warp has 32 neighbouring samples, of which each lane finds one's cell and weights, and each group takes as many
+// side by side as it has lanes. Gradients are added up as long as samples lie in one cell.
 template <int kRows, int V, typename S, int Axes>
 __global__ void __launch_bounds__(kThreads)
-    run_kernel(SampleGridArgs<S, Axes> a, LowerCorners<Axes> corners, bool along_direction, int64_t num_samples,
-               int64_t num_runs, int lanes, S* grad_map) {
+    run_kernel(SampleGridArgs<S, Axes> a, bool along_direction, int64_t num_samples, int lanes, S* grad_map) {
   using T = Compute<S>;
   constexpr int kCorners = 1 << Axes;
   const Group group(lanes);
-  for (int64_t run = group.first(); run < num_runs; run += group.stride()) {
-    const int64_t first = run * kRun, last = first + kRun < num_samples ? first + kRun : num_samples;
-    for (int64_t c = group.lane * V; c < a.channels; c += group.size * V) {
+  for (int64_t base = first_warp() * kWarp; base < num_samples; base += warp_stride() * kWarp) {
+    const int64_t own = base + lane_number();
+    T own_weight[kRows][kCorners] = {};
+    Cell own_cell;
+    if (own < num_samples) {
+      own_cell = find_cell(a, divide(own, a.num_samples), stencil(a, own));
+      scatter_weights<kRows>(a, own, along_direction, own_weight);
+    }
+    for (int64_t c = group.lane * V; c - group.lane * V < a.channels; c += group.size * V) {  // as often in each lane
       T sum[kCorners][V] = {};
-      S* row[kCorners] = {};
-      int64_t held = -1;  // the cell of `sum` and `row`
-      for (int64_t sample = first; sample <= last; ++sample) {
-        const int64_t map = sample < last ? divide(sample, a.num_samples) : 0;
-        const int64_t key = sample < last ? corners.key_of(map, stencil(a, sample)) : -1;
-        if (key < 0 && sample < last) continue;
-        if (key != held) {
+      Cell held;
+      const auto add = [&] {
 #pragma unroll
-          for (int k = 0; k < kCorners; ++k) {
-            if (row[k]) add_pack<V>(row[k] + c, sum[k]);
-            for (int v = 0; v < V; ++v) sum[k][v] = 0;
-          }
-        }
-        if (sample == last) break;
-        if (key != held) {
-          held = key;
-          const Corners<S, Axes> p(grad_map + map * a.stride[Axes], a, stencil(a, sample));
+        for (int k = 0; k < kCorners; ++k) {
+          if (held.inside >> k & 1) add_pack<V>(grad_map + (held.offset + to_corner(a, k) + c), sum[k]);
 #pragma unroll
-          for (int k = 0; k < kCorners; ++k) row[k] = const_cast<S*>(p.row[k]);
+          for (int v = 0; v < V; ++v) sum[k][v] = 0;
         }
+      };
+      for (int turn = 0; turn < group.size; ++turn) {
+        const int from = group.number() * group.size + turn;
+        const Cell cell = cell_of_lane(own_cell, from);
         T weight[kRows][kCorners];
-        scatter_weights<kRows>(a, sample, along_direction, weight);
+#pragma unroll
+        for (int m = 0; m < kRows; ++m) {
+          for (int k = 0; k < kCorners; ++k) weight[m][k] = broadcast(own_weight[m][k], from);
+        }
+        if (cell.inside == 0 || c >= a.channels) continue;
+        if (cell.offset != held.offset || cell.inside != held.inside) {
+          add();
+          held = cell;
+        }
 #pragma unroll
         for (int m = 0; m < kRows; ++m) {
           T value[V];
-          const S* from = gradient_row<kRows>(a, sample, m);
-          load_pack<V>(from ? from + c : nullptr, value);
+          const S* row = gradient_row<kRows>(a, base + from, m);
+          load_constant_pack<V>(row ? row + c : nullptr, value);
 #pragma unroll
           for (int k = 0; k < kCorners; ++k) {
             for (int v = 0; v < V; ++v) sum[k][v] += weight[m][k] * value[v];
           }
         }
       }
+      add();
     }
   }
 }
@@ -513,11 +541,11 @@ void scatter(const SampleGridArgs<S, Axes>& a, int64_t batch, bool along_directi
 
 template <int kRows, typename S, int Axes>
 void add_runs(const SampleGridArgs<S, Axes>& a, int64_t batch, bool along_direction, S* grad_map) {
-  const int64_t num_samples = batch * a.num_samples, num_runs = (num_samples + kRun - 1) / kRun;
+  const int64_t num_samples = batch * a.num_samples;
   by_pack<S>(in_packs<S>(a.channels, a.grad, a.grad_slopes, a.grad_along, grad_map), a.channels,
              [&](auto pack, int lanes) {
-               launch_threads(run_kernel<kRows, decltype(pack)::value, S, Axes>, num_runs * lanes, a,
-                              LowerCorners<Axes>(a, batch), along_direction, num_samples, num_runs, lanes, grad_map);
+               launch_warps(run_kernel<kRows, decltype(pack)::value, S, Axes>, (num_samples + kWarp - 1) / kWarp, a,
+                            along_direction, num_samples, lanes, grad_map);
              });
 }
 
