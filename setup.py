@@ -104,6 +104,8 @@ def choose_cuda(torch_dir: Path) -> tuple[str, str | None]:
     if wanted == "1":
         if not nvcc:
             raise SystemExit("PRED_CUDA=1, but nvcc was not found on PATH")
+        if not (torch_dir / "lib/libtorch_cuda.so").exists():
+            raise SystemExit(f"PRED_CUDA=1, but torch in {torch_dir} was built without CUDA")
         return "ON", None
     if not version:
         return "OFF", "torch was built without CUDA"

@@ -227,3 +227,20 @@ def test_a_failing_compiler_is_an_error(tmp_path: Path) -> None:
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--no-build-isolation", "--no-deps"]
     result = run(*pip, "--target", str(tmp_path / "site"), str(ROOT), CXX=str(compiler))
     assert result.returncode != 0
+
+
+@pytest.mark.parametrize(
+    ("value", "nvcc", "reason"),
+    [
+        ("1", "/nowhere/nvcc", "PRED_CUDA=1, but torch in .* was built without CUDA"),
+        ("2", "", "PRED_CUDA must be auto, 0, 1 or emulate, got 2"),
+    ],
+)
+def test_cuda_that_cannot_be_had_is_an_error_at_once(tmp_path: Path, value: str, nvcc: str, reason: str) -> None:
+    if (Path(torch.__file__).parent / "lib/libtorch_cuda.so").exists() and value == "1":
+        pytest.skip("this torch was built with CUDA")
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--no-build-isolation", "--no-deps"]
+    result = run(*pip, "--target", str(tmp_path / "site"), str(ROOT), PRED_CUDA=value, CUDACXX=nvcc)
+    assert result.returncode != 0
+    assert re.search(reason, result.stdout + result.stderr)
+    assert not (tmp_path / "site").exists()
