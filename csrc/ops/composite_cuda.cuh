@@ -3,9 +3,10 @@
 //
 // What the kernels of composite_rays and composite_alpha share.
 //
-// One warp owns one ray and writes that ray's rows only; 32 of its samples at a time (a turn) have a lane each. Scans
-// over samples are shuffles, in double where light is multiplied up, and are carried from turn to turn. The channels of
-// a sample lie side by side in memory: there, a lane has some neighbouring ones, and a warp as many samples as fit.
+// One warp owns one ray and writes that ray's rows only. In a turn each lane has K neighbouring samples, of which it
+// knows the first of the lane behind, too. Scans over lanes are shuffles, in double where light is multiplied up, and
+// are carried from turn to turn. The channels of a sample lie side by side in memory: there, a lane has some
+// neighbouring ones, and a warp as many samples as fit.
 #pragma once
 
 #include <type_traits>
@@ -52,12 +53,62 @@ struct Columns {
 template <typename S>
 constexpr int kChannels = sizeof(S) == 8 ? 2 : 4;
 
-// Where sample i of a ray is counted.
-template <typename S>
-PRED_DEVICE_ONLY Compute<S> position(const CompositeArgs<S>& a, int64_t at, int64_t i, int64_t count) {
-  using T = Compute<S>;
-  const T here = a.t[at + i];
-  return a.depth_mid && i + 1 < count ? T(0.5) * (here + a.t[at + i + 1]) : here;
+// Samples to a lane: 16 bytes.
+template <typename T>
+constexpr int kSamples = 16 / int(sizeof(T));
+
+// Samples of a ray from this lane's first on, where `left` are left from the turn's first on; more than K where there
+// are any behind this lane's.
+template <int K>
+PRED_DEVICE_ONLY int lane_samples(int64_t left) {
+  constexpr int kMost = kWarp * K + 1;
+  return (left < kMost ? int(left) : kMost) - lane_number() * K;
+}
+
+// x[k] = from[k], and 0 past the `left` that are there. kWritten: by this lane before.
+template <bool kWritten = false, int K, typename T>
+PRED_DEVICE_ONLY void load_samples(const T* from, int left, T (&x)[K]) {
+  if (K > 1 && left >= K && reinterpret_cast<uintptr_t>(from) % sizeof(x) == 0) {
+    if constexpr (kWritten) {
+      load_pack<K>(from, x);
+    } else {
+      read_pack<K>(from, x);
+    }
+  } else {
+#pragma unroll
+    for (int k = 0; k < K; ++k) x[k] = k < left ? from[k] : T(0);
+  }
+}
+
+// to[k] = x[k] for begin <= k < left.
+template <int K, typename T>
+PRED_DEVICE_ONLY void store_samples(T* to, int begin, int left, const T (&x)[K]) {
+  if (K > 1 && begin <= 0 && left >= K && reinterpret_cast<uintptr_t>(to) % sizeof(x) == 0) {
+    store_pack<K>(to, x);
+  } else {
+#pragma unroll
+    for (int k = 0; k < K; ++k) {
+      if (k >= begin && k < left) to[k] = x[k];
+    }
+  }
+}
+
+// Sample K of this lane, which has `first` as its own first one.
+template <int K, typename T>
+PRED_DEVICE_ONLY T first_behind(const T* from, int left, T first) {
+  return from_behind(first, lane_number() == kWarp - 1 && left > K ? from[K] : T(0));
+}
+
+// Where samples are counted, from row `row` on.
+template <int K, typename S, typename T>
+PRED_DEVICE_ONLY void positions(const CompositeArgs<S>& a, int64_t row, int left, T (&position)[K]) {
+  load_samples(a.t + row, left, position);
+  if (!a.depth_mid) return;
+  const T behind = first_behind<K>(a.t + row, left, position[0]);
+#pragma unroll
+  for (int k = 0; k < K; ++k) {
+    if (k + 1 < left) position[k] = T(0.5) * (position[k] + (k + 1 < K ? position[k + 1] : behind));
+  }
 }
 
 template <typename T>
@@ -108,25 +159,48 @@ PRED_DEVICE_ONLY void render_channels(const T* weights, const S* values, int64_t
   }
 }
 
+// The light that arrives at each of a lane's samples, where `transmittance` arrives at the turn; and then behind it.
+template <int K, typename T>
+PRED_DEVICE_ONLY void arriving_light(const Opacity<T> (&here)[K], double& transmittance, double (&light)[K]) {
+  double product[K];
+#pragma unroll
+  for (int k = 0; k < K; ++k) product[k] = k > 0 ? product[k - 1] * here[k].passed : here[k].passed;
+  const double products = prefix_product(product[K - 1]);
+  light[0] = transmittance * from_before(products, 1.0);
+#pragma unroll
+  for (int k = 1; k < K; ++k) light[k] = light[0] * product[k - 1];
+  transmittance *= broadcast(products, kWarp - 1);
+}
+
+// V: channels to a lane; 0: there are none. Field: field(row, left, here) finds the opacities of a lane's samples, and
+// {0, 1} where there are none; all lanes take part.
 template <class Field, int V, class Args, typename S, typename T>
 __global__ void __launch_bounds__(kThreads) forward_kernel(Args a, CompositeOutputs<S> out, int64_t num_rays) {
+  constexpr int K = kSamples<T>;
   const Field field(a);
   for (int64_t ray = first_warp(); ray < num_rays; ray += warp_stride()) {
     const int64_t at = ray_begin(a.rows, ray), count = ray_count(a.rows, ray);
     double transmittance = 1;
     T depth = T(0), opacity = T(0);
-    for (int64_t first = 0; first < count; first += kWarp) {
-      const int64_t i = first + lane_number();
-      const bool there = i < count;
-      Opacity<T> here{T(0), 1.0};
-      if (there) here = field(at, i, count);
-      const double product = prefix_product(here.passed);
-      const T weight = T(transmittance * from_before(product, 1.0) * double(here.alpha));
-      transmittance *= broadcast(product, kWarp - 1);
-      if (!there) continue;
-      out.weights[at + i] = weight;
-      opacity += weight;
-      if (out.depth) depth += weight * position(a, at, i, count);
+    for (int64_t first = 0; first < count; first += kWarp * K) {
+      const int64_t row = at + first + lane_number() * K;
+      const int left = lane_samples<K>(count - first);
+      Opacity<T> here[K];
+      field(row, left, here);
+      double light[K];
+      arriving_light(here, transmittance, light);
+      T weight[K];
+#pragma unroll
+      for (int k = 0; k < K; ++k) {
+        weight[k] = k < left ? T(light[k] * double(here[k].alpha)) : T(0);
+        opacity += weight[k];
+      }
+      store_samples(out.weights + row, 0, left, weight);
+      if (!out.depth) continue;
+      T position[K];
+      positions(a, row, left, position);
+#pragma unroll
+      for (int k = 0; k < K; ++k) depth += weight[k] * position[k];
     }
     opacity = sum_lanes(opacity);
     depth = sum_lanes(depth);
@@ -135,9 +209,11 @@ __global__ void __launch_bounds__(kThreads) forward_kernel(Args a, CompositeOutp
       if (out.depth) out.depth[ray] = depth;
       if (out.remaining) out.remaining[ray] = T(transmittance);
     }
-    if (!out.values) continue;
-    __syncwarp();  // all lanes read the weights
-    render_channels<V>(out.weights + at, a.values + at * a.channels, count, a.channels, out.values + ray * a.channels);
+    if constexpr (V > 0) {
+      __syncwarp();  // all lanes read the weights
+      render_channels<V>(out.weights + at, a.values + at * a.channels, count, a.channels,
+                         out.values + ray * a.channels);
+    }
   }
 }
 
@@ -194,33 +270,53 @@ PRED_DEVICE_ONLY T channel_gradients(const CompositeArgs<S>& a, const CompositeC
   return dot;
 }
 
-// dL/dweight of sample i, but for what comes through the channels.
-template <typename S>
-PRED_DEVICE_ONLY Compute<S> cotangent(const CompositeArgs<S>& a, const CompositeCotangents<S>& grad, int64_t ray,
-                                      int64_t at, int64_t i, int64_t count) {
-  using T = Compute<S>;
-  T sum = grad.opacity ? grad.opacity[ray] : T(0);
-  if (grad.depth) sum += grad.depth[ray] * position(a, at, i, count);
-  if (grad.weights) sum += grad.weights[at + i];
-  return sum;
+// dL/dweight of samples from row `row` on, but for what comes through the channels.
+template <int K, typename S, typename T>
+PRED_DEVICE_ONLY void cotangents(const CompositeArgs<S>& a, const CompositeCotangents<S>& grad, int64_t ray,
+                                 int64_t row, int left, T (&sum)[K]) {
+  const T of_opacity = grad.opacity ? grad.opacity[ray] : T(0);
+#pragma unroll
+  for (int k = 0; k < K; ++k) sum[k] = of_opacity;
+  T x[K];
+  if (grad.depth) {
+    const T of_depth = grad.depth[ray];
+    positions(a, row, left, x);
+#pragma unroll
+    for (int k = 0; k < K; ++k) sum[k] += of_depth * x[k];
+  }
+  if (grad.weights) {
+    load_samples(grad.weights + row, left, x);
+#pragma unroll
+    for (int k = 0; k < K; ++k) sum[k] += x[k];
+  }
+#pragma unroll
+  for (int k = 0; k < K; ++k) sum[k] = k < left ? sum[k] : T(0);
 }
 
-// The gradient of t_i, from the weights of samples i and i - 1.
-template <typename T>
-PRED_DEVICE_ONLY T position_gradient(bool depth_mid, T grad_depth, T weight, T weight_before, int64_t i,
-                                     int64_t count) {
-  if (!depth_mid) return grad_depth * weight;
-  // Sample i ends section i - 1 and starts section i; the last sample counts at itself.
-  const T own = i + 1 < count ? T(0.5) * (grad_depth * weight) : grad_depth * weight;
-  return i > 0 ? own + T(0.5) * grad_depth * weight_before : own;
+// The gradient of t of samples from row `row` on, from their weights and the one before them (0 where there is none).
+template <int K, typename T>
+PRED_DEVICE_ONLY void position_gradients(bool depth_mid, T grad_depth, const T (&weight)[K], T before, int left,
+                                         T* to) {
+  T x[K];
+#pragma unroll
+  for (int k = 0; k < K; ++k) {
+    x[k] = grad_depth * weight[k];
+    if (!depth_mid) continue;
+    // A sample ends a section and starts another; the last one counts at itself.
+    if (k + 1 < left) x[k] *= T(0.5);
+    x[k] += T(0.5) * grad_depth * (k > 0 ? weight[k - 1] : before);
+  }
+  store_samples(to, 0, left, x);
 }
 
-// Calls body(std::integral_constant<int, V>) with the channels of a lane, of rows of values.
+// Calls body(std::integral_constant<int, V>) with the channels of a lane, of rows of values; 0 where there are none.
 template <typename S, class Body, typename... Rows>
 void by_channels(int64_t channels, const Body& body, const Rows*... rows) {
   constexpr int64_t kBytes = kChannels<S> * sizeof(S);
   const bool aligned = ((reinterpret_cast<uintptr_t>(rows) | ...) % kBytes) == 0;
-  if (channels % kChannels<S> == 0 && aligned) {
+  if (channels == 0) {
+    body(std::integral_constant<int, 0>{});
+  } else if (channels % kChannels<S> == 0 && aligned) {
     body(std::integral_constant<int, kChannels<S>>{});
   } else {
     body(std::integral_constant<int, 1>{});
@@ -230,7 +326,7 @@ void by_channels(int64_t channels, const Body& body, const Rows*... rows) {
 template <class Field, class Args, typename S = typename Args::Storage, typename T = Compute<S>>
 void forward(const Args& a, const CompositeOutputs<S>& out, T*, int64_t, int64_t, int64_t num_rays) {
   by_channels<S>(
-      a.channels,
+      out.values ? a.channels : 0,
       [&](auto channels) {
         launch_warps(forward_kernel<Field, decltype(channels)::value, Args, S, T>, num_rays, a, out, num_rays);
       },

@@ -17,11 +17,23 @@ struct DistanceField {
 
   __device__ explicit DistanceField(const CompositeRaysArgs<S>& args) : a(args), s(exp_scale(*args.inv_s)) {}
 
-  __device__ Opacity<T> operator()(int64_t at, int64_t i, int64_t count) const {
-    if (i + 1 == count) return {a.last_opaque ? T(1) : T(0), a.last_opaque ? 0.0 : 1.0};
-    const T sdf = a.source[at + i], next = a.source[at + i + 1];
-    const PairAlpha<T> pair = pair_alpha(s, sdf, next, phi(s, next));
-    return {pair.alpha, pair.alpha < T(0.5) ? 1.0 - double(pair.alpha) : double(pair.passed)};
+  template <int K>
+  __device__ void operator()(int64_t row, int left, Opacity<T> (&here)[K]) const {
+    T sdf[K];
+    load_samples(a.source + row, left, sdf);
+    const T behind = first_behind<K>(a.source + row, left, sdf[0]);
+#pragma unroll
+    for (int k = 0; k < K; ++k) {
+      const T next = k + 1 < K ? sdf[k + 1] : behind;
+      // Behind the last one nothing rises, and all light passes.
+      const PairAlpha<T> pair = alpha_of_rise(s, k + 1 < left ? next - sdf[k] : T(0), phi(s, next));
+      here[k] = {pair.alpha, pair.alpha < T(0.5) ? 1.0 - double(pair.alpha) : double(pair.passed)};
+    }
+    if (!a.last_opaque) return;
+#pragma unroll
+    for (int k = 0; k < K; ++k) {
+      if (k + 1 == left) here[k] = {T(1), 0.0};
+    }
   }
 };
 
@@ -43,12 +55,14 @@ PRED_DEVICE_ONLY Sample<T> first_sample(const Sample<T>& own) {
   return {broadcast(own.sdf, 0), broadcast(own.cotangent, 0), broadcast(own.h, 0), broadcast(own.falls, 0)};
 }
 
+// V: channels to a lane; 0: there are none, and a lane has several samples.
 template <bool kSource, bool kValues, int V, typename S, typename T = Compute<S>>
 __global__ void __launch_bounds__(kThreads)
     backward_kernel(CompositeRaysArgs<S> a, CompositeSaved<T> saved, CompositeCotangents<S> grad,
                     CompositeGradients<S> out, int64_t num_rays) {
+  constexpr int K = V > 0 ? 1 : kSamples<T>;
   __shared__ Tile<T> tiles[kThreads / kWarp];
-  Tile<T>& tile = tiles[threadIdx.x / kWarp];
+  [[maybe_unused]] Tile<T>& tile = tiles[threadIdx.x / kWarp];
   const T inv_s = *a.inv_s;
   const ExpScale<T> s = exp_scale(inv_s);
   for (int64_t ray = first_warp(); ray < num_rays; ray += warp_stride()) {
@@ -57,45 +71,76 @@ __global__ void __launch_bounds__(kThreads)
     // remains: a sum of positive numbers, as exact where next to nothing is left as where all is.
     T light_behind = saved.remaining[ray], gain_behind = T(0), total = T(0);
     Sample<T> behind{};
-    for (int64_t first = (count - 1) / kWarp * kWarp; count > 0 && first >= 0; first -= kWarp) {
-      const int64_t i = first + lane_number();
-      const bool there = i < count;
-      const T weight = there ? saved.weights[at + i] : T(0);
-      if (out.t && there) {
-        const T before = i > 0 ? saved.weights[at + i - 1] : T(0);
-        out.t[at + i] = position_gradient(a.depth_mid, grad.depth[ray], weight, before, i, count);
+    for (int64_t first = (count - 1) / (kWarp * K) * (kWarp * K); count > 0 && first >= 0; first -= kWarp * K) {
+      const int64_t row = at + first + lane_number() * K;
+      const int left = lane_samples<K>(count - first);
+      const bool first_lane = lane_number() == 0;
+      T weight[K];
+      load_samples(saved.weights + row, left, weight);
+      if (out.t) {
+        const T before = from_before(weight[K - 1], first_lane && first > 0 ? saved.weights[row - 1] : T(0));
+        position_gradients(a.depth_mid, grad.depth[ray], weight, before, left, out.t + row);
       }
-      Sample<T> own{};
-      if (kSource && there) own.cotangent = cotangent(a, grad, ray, at, i, count);
-      if (grad.values) {
+      T own[K];
+      if (kSource) cotangents(a, grad, ray, row, left, own);
+      if constexpr (V > 0) {
         const T dot =
-            channel_gradients<V, kSource, kValues>(a, grad, out, weight, ray, at + first, count - first, tile);
-        if (there) own.cotangent += dot;
+            channel_gradients<V, kSource, kValues>(a, grad, out, weight[0], ray, at + first, count - first, tile);
+        if (kSource && left > 0) own[0] += dot;
       }
       if (!kSource) continue;
-      own.sdf = there ? a.source[at + i] : T(0);
-      const T next_sdf = from_behind(own.sdf, behind.sdf);
-      own.falls = i + 1 < count && own.sdf > next_sdf;
-      const T weights = suffix_sum(weight), gains = suffix_sum(there ? weight * own.cotangent : T(0));
-      // T_{i+1} and S_i
-      const T light_after = light_behind + from_behind(weights, T(0)),
-              gain_after = gain_behind + from_behind(gains, T(0));
-      own.h = own.falls ? light_after * own.cotangent - gain_after : T(0);
-      const Sample<T> next = sample_behind(own, behind);
-      if (i + 1 < count) {
-        const T slope = slope_of_distance(phi(s, next.sdf).occupied, bool(own.falls), bool(next.falls), light_after,
-                                          own.cotangent, next.cotangent, own.h, next.h);
-        if (out.source) out.source[at + i + 1] = inv_s * slope;
-        total += slope * next.sdf;
+      T sdf[K];
+      load_samples(a.source + row, left, sdf);
+      const T next_sdf = from_behind(sdf[0], behind.sdf);
+      // Of each sample, T_{i+1} and S_i: first what this lane has of them.
+      T light_after[K], gain_after[K], weights = T(0), gains = T(0);
+#pragma unroll
+      for (int k = K - 1; k >= 0; --k) {
+        light_after[k] = weights;
+        gain_after[k] = gains;
+        weights += weight[k];
+        gains += weight[k] * own[k];
       }
-      if (i == 0) {
-        const T slope = phi(s, own.sdf).occupied * own.h;
-        if (out.source) out.source[at] = inv_s * slope;
-        total += slope * own.sdf;
+      weights = suffix_sum(weights);
+      gains = suffix_sum(gains);
+      const T later_light = light_behind + from_behind(weights, T(0)),
+              later_gain = gain_behind + from_behind(gains, T(0));
+      T h[K];
+      int falls[K];
+#pragma unroll
+      for (int k = 0; k < K; ++k) {
+        light_after[k] += later_light;
+        gain_after[k] += later_gain;
+        falls[k] = k + 1 < left && sdf[k] > (k + 1 < K ? sdf[k + 1] : next_sdf);
+        h[k] = falls[k] ? light_after[k] * own[k] - gain_after[k] : T(0);
+      }
+      const Sample<T> mine{sdf[0], own[0], h[0], falls[0]}, next = sample_behind(mine, behind);
+      T slope[K];  // at the sample behind each
+#pragma unroll
+      for (int k = 0; k < K; ++k) {
+        const Sample<T> after = k + 1 < K ? Sample<T>{sdf[k + 1], own[k + 1], h[k + 1], falls[k + 1]} : next;
+        slope[k] = slope_of_distance(phi(s, after.sdf).occupied, bool(falls[k]), bool(after.falls), light_after[k],
+                                     own[k], after.cotangent, h[k], after.h);
+        if (k + 1 >= left) slope[k] = T(0);
+        total += slope[k] * after.sdf;
+      }
+      T first_slope = T(0);
+      if (first_lane && first == 0) {
+        first_slope = phi(s, sdf[0]).occupied * h[0];
+        total += first_slope * sdf[0];
+      }
+      const T before = from_before(slope[K - 1], first_slope);
+      if (out.source) {
+        T gradient[K];
+#pragma unroll
+        for (int k = 0; k < K; ++k) gradient[k] = inv_s * (k > 0 ? slope[k - 1] : before);
+        // A turn's first sample is known in the turn before it only.
+        store_samples(out.source + row, first_lane && first > 0 ? 1 : 0, left, gradient);
+        if (lane_number() == kWarp - 1 && left > K) out.source[row + K] = inv_s * slope[K - 1];
       }
       light_behind += broadcast(weights, 0);
       gain_behind += broadcast(gains, 0);
-      behind = first_sample(own);
+      behind = first_sample(mine);
     }
     if (!kSource || !out.inv_s) continue;
     total = sum_lanes(total);
@@ -108,11 +153,11 @@ void backward(const CompositeRaysArgs<S>& a, const CompositeSaved<T>& saved, con
               const CompositeGradients<S>& out, T*, int64_t, int64_t, int64_t num_rays) {
   const bool source = out.source || out.inv_s, values = out.values != nullptr;
   by_channels<S>(
-      a.channels,
+      grad.values ? a.channels : 0,
       [&](auto channels) {
         constexpr int V = decltype(channels)::value;
-        const auto kernel = source   ? values ? backward_kernel<true, true, V, S> : backward_kernel<true, false, V, S>
-                            : values ? backward_kernel<false, true, V, S>
+        const auto kernel = source   ? values ? backward_kernel<true, V != 0, V, S> : backward_kernel<true, false, V, S>
+                            : values ? backward_kernel<false, V != 0, V, S>
                                      : backward_kernel<false, false, V, S>;
         launch_warps(kernel, num_rays, a, saved, grad, out, num_rays);
       },
