@@ -11,6 +11,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -177,9 +178,29 @@ def test_library_reaches_no_wide_instruction_but_through_its_tables(build: Path)
     assert seen == {"avx2", "avx512", "avx512_bf16"}  # the check can see them
 
 
-def test_wheel_serves_every_python(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def source_archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sdist")
+    build_sdist = "import sys, setuptools.build_meta as backend; backend.build_sdist(sys.argv[1])"
+    result = run(sys.executable, "-c", build_sdist, str(folder))
+    assert result.returncode == 0, result.stdout + result.stderr
+    (archive,) = folder.glob("pred_lidar-*.tar.gz")
+    return archive
+
+
+def test_source_archive_holds_every_source_and_no_build(source_archive: Path) -> None:
+    with tarfile.open(source_archive) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    tracked = run("git", "ls-files", "csrc", "pred", "tests", "benchmarks", "docs", "CMakeLists.txt", "Makefile")
+    if tracked.returncode:
+        pytest.skip("not a git checkout, whose files would say what must be there")
+    assert set(tracked.stdout.splitlines()) - names == set()
+    assert not [name for name in names if name.endswith((".so", ".pyc")) or name == "pred/build_info.json"]
+
+
+def test_wheel_serves_every_python(tmp_path: Path, source_archive: Path) -> None:
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "--no-build-isolation", "--no-deps"]
-    result = run(*pip, "-w", str(tmp_path), str(ROOT), PRED_REQUIRE_NATIVE="1")
+    result = run(*pip, "-w", str(tmp_path), str(source_archive), PRED_REQUIRE_NATIVE="1")
     assert result.returncode == 0, result.stdout + result.stderr
     (wheel,) = tmp_path.glob("*.whl")
     assert re.fullmatch(r"pred_lidar-[\d.]+-py3-none-\w+\.whl", wheel.name)
