@@ -93,10 +93,12 @@ def export(
     folder.require()
     # What cannot be written is refused before the long work.
     require_place(out)
-    if out.resolve().is_relative_to(folder.path.resolve()):
-        raise ValueError(f"export: out must not lie in the run folder, whose files belong to the run, got {out}")
-    if checkpoint is not None and checkpoint.resolve() in (out.resolve(), sidecar(out).resolve()):
-        raise ValueError(f"export: out must not replace the checkpoint, got {out} and {checkpoint}")
+    for parent in out.resolve().parents:
+        if parent == folder.path.resolve() or RunFolder(parent).info.is_file():
+            raise ValueError(f"export: out must not lie in a run folder, whose files belong to the run, got {out}")
+    for name, path in {"the checkpoint": checkpoint, "against": against}.items():
+        if path is not None and path.resolve() in (out.resolve(), sidecar(out).resolve()):
+            raise ValueError(f"export: out must not replace {name}, got {out} and {path}")
     model, checkpoint = load_model(config, folder, checkpoint)
     conv_here = has_conv_for_no_stride(model.encoder)
     shapes = choose_parts(shapes_of(model.encoder.state_dict()), parts)

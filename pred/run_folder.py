@@ -95,24 +95,35 @@ class RunFolder:
             raise RunFolderError(f"{self.path}: run folder must hold config.yaml, got none: no run was started here")
 
     def is_imported(self) -> bool:
-        """Whether the weights come from elsewhere (`pred import`), not from a training here."""
-        return self.info.is_file() and "imported" in json.loads(self.info.read_text())
+        """Whether the weights come from elsewhere (`pred import`), not from a training here.
+
+        Raises:
+            RunFolderError: run.json is damaged.
+        """
+        return "imported" in self._read_info()
 
     def record_start(self, facts: Mapping[str, Any], resumed_step: int | None) -> None:
-        """Add this process to run.json; a resumed run keeps the record of its first start."""
+        """Add this process to run.json; a resumed run keeps the record of its first start.
+
+        Raises:
+            RunFolderError: run.json of the first start is damaged.
+        """
         record = {
             "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
             "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
             **environment(),
             **facts,
         }
-        content: dict[str, Any] = {}
-        if resumed_step is not None and self.info.is_file():
-            content = json.loads(self.info.read_text())
+        content = self._read_info() if resumed_step is not None else {}
+        if content:
             content.setdefault("resumed", []).append({"step": resumed_step, **record})
-        else:
-            content = record
-        write_json(self.info, content)
+        write_json(self.info, content or record)
+
+    def _read_info(self) -> dict[str, Any]:
+        """What run.json holds; nothing where there is none."""
+        if not self.info.is_file():
+            return {}
+        return _read_object(self.info, "the record of the run")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -168,15 +179,23 @@ def claim_settings(path: Path, wanted: Mapping[str, Any], ignored: Collection[st
         folder.mkdir(parents=True, exist_ok=True)
         write_json(path, wanted)
         return
+    found = _read_object(path, "the settings of the job")
+    wanted = json.loads(json.dumps(wanted))
+    for name in sorted({*wanted, *found} - {*ignored}):
+        if found.get(name) != wanted.get(name):
+            raise RunFolderError(
+                f"{folder}: {name} must be {found.get(name)!r} as in {path.name}, got {wanted.get(name)!r}"
+            )
+
+
+def _read_object(path: Path, meaning: str) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text())
     except ValueError as error:
-        raise RunFolderError(f"{path}: must be the settings of the job, got no valid JSON: {error}") from None
-    wanted = json.loads(json.dumps(wanted))
-    for name in sorted({*wanted, *found} - {*ignored} if isinstance(found, dict) else wanted):
-        value = found.get(name) if isinstance(found, dict) else None
-        if value != wanted.get(name):
-            raise RunFolderError(f"{folder}: {name} must be {value!r} as in {path.name}, got {wanted.get(name)!r}")
+        raise RunFolderError(f"{path}: must be {meaning}, got no valid JSON: {error}") from None
+    if not isinstance(found, dict):
+        raise RunFolderError(f"{path}: must be {meaning}, a JSON object, got {type(found).__name__}")
+    return found
 
 
 def environment() -> dict[str, Any]:

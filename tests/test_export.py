@@ -212,6 +212,9 @@ def test_parts_are_left_out_only_on_request(run: Path, tmp_path: Path) -> None:
 def test_where_a_file_may_be_written(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Said before any scan is read."""
     config = tiny_config(run)
+    other = tmp_path / "other"
+    (other / "checkpoints").mkdir(parents=True)
+    (other / "run.json").write_text("{}")
     (tmp_path / "mine.pth.json").write_text('{"notes": "of the user"}')
     files = list(run.rglob("*"))
     before = {path: path.read_bytes() for path in files if path.is_file()}
@@ -220,8 +223,9 @@ def test_where_a_file_may_be_written(run: Path, tmp_path: Path, capsys: pytest.C
         (tmp_path, "must be a file to write, got a folder"),
         (Path("."), "must be a file to write, got a folder"),
         (tmp_path / "none" / "a.pth", "none/a.pth: folder must exist, got none"),
-        *((path, "out must not lie in the run folder") for path in files if path.is_file()),
-        (run / "new.pth", "out must not lie in the run folder"),
+        *((path, "out must not lie in a run folder") for path in files if path.is_file()),
+        (run / "new.pth", "out must not lie in a run folder"),
+        (other / "checkpoints" / "new.pth", "out must not lie in a run folder"),
         (tmp_path / "mine.pth", r"mine\.pth\.json: must be absent or of `pred export`, got another file"),
     ):
         with pytest.raises((CheckpointError, ValueError), match=text):
@@ -230,6 +234,11 @@ def test_where_a_file_may_be_written(run: Path, tmp_path: Path, capsys: pytest.C
     shutil.copy(list_checkpoints(run / "checkpoints")[-1], elsewhere)
     with pytest.raises(ValueError, match="out must not replace the checkpoint"):
         export(config, run, "openpcdet", elsewhere, checkpoint=elsewhere)
+    names = tmp_path / "names.txt"
+    names.write_text("vfe.weight (1) float32\n")
+    with pytest.raises(ValueError, match="out must not replace against"):
+        export(config, run, "openpcdet", names, against=names)
+    assert names.read_text() == "vfe.weight (1) float32\n"
     assert "recalibrating" not in capsys.readouterr().err
     assert (tmp_path / "mine.pth.json").read_text() == '{"notes": "of the user"}'
     assert {path: path.read_bytes() for path in before} == before

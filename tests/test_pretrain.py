@@ -326,6 +326,16 @@ def test_resume_without_a_run(tmp_path: Path) -> None:
         pretrain(tiny_config(tmp_path / "empty"), resume=True)
 
 
+@pytest.mark.parametrize(("text", "fact"), [('{"seed":', "no valid JSON"), ("[1]", "a JSON object, got list")])
+def test_a_damaged_record_is_named(tmp_path: Path, text: str, fact: str) -> None:
+    folder = RunFolder(tmp_path / "run")
+    folder.start("")
+    folder.info.write_text(text)
+    with pytest.raises(RunFolderError, match=rf"run\.json: must be the record of the run, .*{fact}"):
+        pretrain(tiny_config(folder.path), resume=True)
+    assert folder.info.read_text() == text
+
+
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_writes_a_checkpoint_and_says_how_to_go_on(
     finished: Path,
