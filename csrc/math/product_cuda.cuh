@@ -52,7 +52,9 @@ struct alignas(16) SharedTile {
 
 // --- Tensor cores --------------------------------------------------------------------------------
 // mma_...: d += a b for one piece, in the layout of the instructions: lane 4 g + t has d of rows g and g + 8, columns
-// 2 t and 2 t + 1; the first of them d = a b. They round sums toward zero.
+// 2 t and 2 t + 1; the first of them d = a b. Terms of a sum lose what lies below the last bit of the largest, and the
+// sum is rounded toward zero (Fasi et al., Numerical behavior of NVIDIA tensor cores, 2021). Volatile: all lanes take
+// part, and so none may be moved to where only some of them come.
 // load_matrices: four matrices of 8 x 8 pairs of bytes in shared memory, of which lane 8 i + r names row r of matrix i
 // (16 bytes, aligned). Lane 4 g + t gets elements 2 t and 2 t + 1 of row g of each, or of column g of its transpose.
 #if !defined(__CUDACC__)
@@ -61,6 +63,15 @@ constexpr bool kTensorCores = true;
 inline float round_toward_zero(double x) {
   const float near = float(x);
   return __builtin_fabs(double(near)) > __builtin_fabs(x) ? __builtin_nextafterf(near, 0.0f) : near;
+}
+
+template <int kTerms>
+inline float tensor_core_sum(const double (&term)[kTerms]) {
+  double largest = 0, sum = 0, unit = 0;
+  for (double x : term) largest = __builtin_fmax(largest, __builtin_fabs(x));
+  if (largest > 0 && largest < __builtin_inf()) unit = __builtin_ldexp(1, __builtin_ilogb(largest) - 23);
+  for (double x : term) sum += unit > 0 ? __builtin_trunc(x / unit) * unit : x;
+  return round_toward_zero(sum);
 }
 
 // Emulated: the lanes give each other their fragments.
@@ -78,12 +89,12 @@ inline void emulate_mma(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint
   const int g = int(threadIdx.x % kWarp) / 4, t = int(threadIdx.x % kWarp) % 4;
   for (int i = 0; i < 4; ++i) {
     const int half = i / 2, column = 2 * t + i % 2;  // row g + 8 half
-    double sum = double(d[i]);
+    double term[9] = {double(d[i])};
     for (int part = 0; part < 4; ++part) {
-      sum += multiply(all_a[half][4 * g + part], all_b[0][4 * column + part]);
-      sum += multiply(all_a[2 + half][4 * g + part], all_b[1][4 * column + part]);
+      term[1 + part] = multiply(all_a[half][4 * g + part], all_b[0][4 * column + part]);
+      term[5 + part] = multiply(all_a[2 + half][4 * g + part], all_b[1][4 * column + part]);
     }
-    d[i] = round_toward_zero(sum);
+    d[i] = tensor_core_sum(term);
   }
 }
 template <typename S>
@@ -118,11 +129,15 @@ constexpr bool kTensorCores = true;
 template <typename S>
 PRED_DEVICE_ONLY void mma_half(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
   if constexpr (std::is_same_v<S, BFloat16>) {
-    asm("mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+    asm volatile(
+        "mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 "
+        "{%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
         : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
         : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
   } else {
-    asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+    asm volatile(
+        "mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 "
+        "{%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
         : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
         : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
   }
@@ -130,11 +145,15 @@ PRED_DEVICE_ONLY void mma_half(float (&d)[4], const uint32_t (&a)[4], uint32_t b
 template <bool kFirst>
 PRED_DEVICE_ONLY void mma_tf32(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
   if constexpr (kFirst) {
-    asm("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%10,%10,%10,%10};"
+    asm volatile(
+        "mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 "
+        "{%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%10,%10,%10,%10};"
         : "=f"(d[0]), "=f"(d[1]), "=f"(d[2]), "=f"(d[3])
         : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1), "f"(0.0f));
   } else {
-    asm("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+    asm volatile(
+        "mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 "
+        "{%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
         : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
         : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
   }
