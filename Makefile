@@ -110,15 +110,17 @@ cuda-build:
 	PRED_CUDA=1 PRED_REQUIRE_NATIVE=1 CUDAARCHS=native $(PYTHON) setup.py -q build_ext --inplace
 
 # PRED_TEST_DEVICE takes CPU tensors through the GPU (tests/conftest.py), here in JOBS processes; parity with the CPU is
-# tested without it. The sanitizers look at this library's kernels alone; memcheck sees a tensor's end only without
-# torch's allocator. cuBLAS, which the tests use, wants to be told how to repeat.
+# tested without it. These share the cores: more threads than cores wait for each other. The sanitizers look at this
+# library's kernels alone; memcheck sees a tensor's end only without torch's allocator. cuBLAS, which the tests use, wants
+# to be told how to repeat.
 CUDA_SANITIZER := compute-sanitizer --error-exitcode 1 --target-processes all --report-api-errors no \
 	--kernel-name kernel_substring=pred
 JOBS ?= 4
 test-cuda: export CUBLAS_WORKSPACE_CONFIG := :4096:8
 test-cuda: cuda-build
 	PRED_REQUIRE_NATIVE=1 $(PYTHON) -m pytest -q tests/test_cuda.py
-	PRED_TEST_DEVICE=cuda PRED_REQUIRE_NATIVE=1 $(PYTHON) -m pytest -q -n $(JOBS) $(CUDA_TESTS)
+	PRED_TEST_DEVICE=cuda PRED_REQUIRE_NATIVE=1 OMP_NUM_THREADS=$$(( ($$(nproc) + $(JOBS) - 1) / $(JOBS) )) \
+		$(PYTHON) -m pytest -q -n $(JOBS) $(CUDA_TESTS)
 	PYTORCH_NO_CUDA_MEMORY_CACHING=1 $(CUDA_SANITIZER) --tool memcheck \
 		$(PYTHON) -m pytest -q tests/test_cuda.py -k "parity and float32"
 	$(CUDA_SANITIZER) --tool racecheck $(PYTHON) -m pytest -q tests/test_cuda.py -k "parity_with and float32"
