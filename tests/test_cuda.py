@@ -166,3 +166,10 @@ def test_the_tensors_device_counts(native: None, deterministic: None, example: E
 def test_devices_must_agree(native: None) -> None:
     with pytest.raises((ValueError, RuntimeError), match="grid"):
         ops.sample_bev(torch.zeros(1, 2, 3, 4, device="cuda"), torch.zeros(1, 5, 2))
+
+
+@pytest.mark.skipif(torch.__version__ < "2.13", reason="torch prints the cause, and hands out none")
+def test_memory_that_does_not_suffice_is_the_cause(native: None) -> None:
+    grid = torch.zeros(1, 1, 2, device="cuda").expand(1, 1 << 40, 2)
+    with pytest.raises(RuntimeError, match="pred::sample_bev: .*out of memory"):
+        ops.sample_bev(torch.zeros(1, 2, 3, 4, device="cuda"), grid)

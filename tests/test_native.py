@@ -64,6 +64,14 @@ def test_direct_calls_are_checked(native: None) -> None:
         torch.ops.pred.sample_bev(bev.int(), grid, False, False)
 
 
+@pytest.mark.skipif(torch.__version__ < "2.13", reason="torch prints the cause, and hands out none")
+def test_memory_that_does_not_suffice_is_the_cause(native: None) -> None:
+    """And not only that a call of torch failed, as its headers say."""
+    grid = torch.zeros(1, 1, 2).expand(1, 1 << 44, 2)
+    with pytest.raises(RuntimeError, match=r"pred::sample_bev: .*can't allocate memory"):
+        torch.ops.pred.sample_bev(torch.zeros(1, 2, 3, 4), grid, False, False)
+
+
 @pytest.mark.parametrize(
     "transform", [torch.func.grad, lambda f: lambda x: torch.func.jvp(f, (x,), (torch.ones_like(x),))]
 )

@@ -13,7 +13,10 @@
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/tensor.h>
 
+#include <cstring>
 #include <optional>
+#include <stdexcept>
+#include <string>
 #include <type_traits>
 
 #if defined(PRED_LAUNCH) && !defined(PRED_EMULATED)
@@ -24,6 +27,9 @@
 #else
 #define PRED_DEVICE CPU
 #endif
+
+// Of torch 2.13 and later; null in others.
+extern "C" __attribute__((weak)) const char* torch_exception_get_what_without_backtrace();
 
 namespace pred {
 
@@ -64,6 +70,25 @@ class DeviceScope {
 
   torch::stable::accelerator::DeviceGuard guard_;
 };
+#else
+constexpr const char* kRightDevice = "a CPU tensor";
+inline bool on_right_device(const torch::stable::Tensor& tensor) { return tensor.is_cpu(); }
+
+struct DeviceScope {
+  template <class... Arguments>
+  explicit DeviceScope(const char*, const Arguments&...) {}
+};
+#endif
+
+// What torch's headers throw names the function of torch that failed, most often for want of memory. Why it failed,
+// torch keeps for those who ask (from 2.13 on), or has printed.
+[[noreturn]] inline void rethrow_with_cause(const char* op, const std::runtime_error& error) {
+  const bool of_torch = std::strstr(error.what(), "API call failed") != nullptr;
+  const char* cause =
+      of_torch && torch_exception_get_what_without_backtrace ? torch_exception_get_what_without_backtrace() : nullptr;
+  if (!cause) throw;
+  throw std::runtime_error(std::string(op) + ": " + cause);
+}
 
 template <auto function, class Name>
 struct OnDevice;
@@ -71,7 +96,11 @@ template <class Result, class... Arguments, Result (*function)(Arguments...), cl
 struct OnDevice<function, Name> {
   static Result call(Arguments... arguments) {
     const DeviceScope scope(Name::text(), arguments...);
-    return function(arguments...);
+    try {
+      return function(arguments...);
+    } catch (const std::runtime_error& error) {
+      rethrow_with_cause(Name::text(), error);
+    }
   }
 };
 
@@ -83,11 +112,5 @@ struct OnDevice<function, Name> {
     };                                                                  \
     m.impl(name, TORCH_BOX((&::pred::OnDevice<function, Name>::call))); \
   } while (0)
-#else
-constexpr const char* kRightDevice = "a CPU tensor";
-inline bool on_right_device(const torch::stable::Tensor& tensor) { return tensor.is_cpu(); }
-
-#define PRED_IMPL(m, name, function) m.impl(name, TORCH_BOX(function))
-#endif
 
 }  // namespace pred
